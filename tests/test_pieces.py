@@ -21,8 +21,9 @@ from helpers.waits import nobody_waits
 import gvtorch as gv
 from gvtorch.tracing import clip, composite, lighting
 from gvtorch.tracing.composite import trace_pieces
+from gvtorch.tracing.effects import TreeTrace
 from gvtorch.tracing.tracer import Tracer
-from gvtorch.tracing.trees import TreeTrace, trace_trees
+from gvtorch.tracing.trees import trace_trees
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+from typing import get_type_hints
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +13,8 @@ from helpers.shading import CENTRE, RADIUS, SPACING, ball, grid, parallel, phong
 
 import gvtorch as gv
 from gvtorch.ops.shading import IsosurfaceNumbers, LightKind, ShadeParameters
+from gvtorch.shaders.built_in import SurfaceSettings
+from gvtorch.shaders.lights import LightSettings, LitShader
 from gvtorch.tracing.tracer import Tracer
 
 WHITE = gv.TransferFunction.from_points([(0, 1)], [(0, 1, 1, 1)])
@@ -294,3 +299,14 @@ def test_gradient_magnitude_scales_the_optical_depth_of_a_ramp(backend, share):
     hits = shoot(tree, rays.to(DEVICES[backend]), shader, backend, stop_alpha=1.0)
     expected = 1 - (1 - 0.3) ** (8 / 10 * min(share, 1.0))
     assert abs(float(hits["alpha"][0, 0]) - expected) < 2e-5
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"), [(LitShader, LightSettings), (gv.Isosurface, SurfaceSettings)]
+)
+def test_keywords_that_shaders_pass_on_are_those_of_their_base(kind, settings):
+    hints = get_type_hints(kind.__init__)
+    parameters = inspect.signature(kind.__init__).parameters.values()
+    own = {p.name: hints[p.name] for p in parameters if p.kind is p.KEYWORD_ONLY}
+    inherited = {} if kind is LitShader else get_type_hints(LightSettings)
+    assert get_type_hints(settings) == own | inherited

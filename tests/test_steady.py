@@ -269,7 +269,7 @@ def test_a_replayed_graph_on_cuda_is_the_frame(cuda, blobs, trees):
             for name in ("samples", "tiles_used", "bricks_used", "rays", "misses", "bytes"):
                 assert getattr(stats, name) == getattr(expected_stats, name), name
         engine.validate()
-        with pytest.raises(ValueError, match="camera must be 1 of 64x64 pixels as captured"):
+        with pytest.raises(ValueError, match=r"must be 1 of 64x64 pixels \(pinhole\) as captured"):
             graph.replay(camera(32))
 
 

@@ -21,6 +21,7 @@ shader = gv.TransferFunction([(0, 0), (1, 0.5)])
 reveal_type(gv.render(tree, gv.Camera.orbit(), shader, step=0.5, lod="finest").color)
 reveal_type(tree.to_volume())
 gv.render(tree, gv.Camera.orbit(), shader, stp=1)
+gv.DistanceField(offset=1.0, filled=False, diffus=1.0)
 """
 
 
@@ -34,12 +35,14 @@ def test_a_strict_project_sees_the_types(tmp_path):
     call = [sys.executable, "-m", "mypy", "--strict", "--python-executable", python, "use.py"]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False)
     lines = [line.partition(": ")[2] for line in done.stdout.splitlines()]
-    assert lines[:3] == [
+    assert [line for line in lines if line and "defined in" not in line] == [
         'note: Revealed type is "torch._tensor.Tensor"',
         'note: Revealed type is "gvtorch.base.volume.Volume"',
         'error: Unexpected keyword argument "stp" for "render"; did you mean "step"?  [call-arg]',
+        'error: Unexpected keyword argument "diffus" for "DistanceField"; did you mean "diffuse"?  '
+        "[call-arg]",
     ], done.stdout + done.stderr
-    assert "Found 1 error" in done.stdout
+    assert "Found 2 errors" in done.stdout
 
 
 def test_an_editable_install_is_a_path():

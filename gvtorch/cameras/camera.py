@@ -11,7 +11,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -50,6 +50,21 @@ class Frame(Enum):
     def unit(self, box: Tensor) -> float:
         """Returns its unit of length, world units, given the (2, 3) box of the scene."""
         return 1.0 if self is Frame.WORLD else float((box[1] - box[0]).max())
+
+
+class CameraForm(NamedTuple):
+    """What cameras must share to be drawn by the same graph."""
+
+    cameras: int  # their number
+    height: int  # pixels
+    width: int
+    batched: bool
+    model: CameraModel
+    distorted: bool
+    window: tuple[int, int]  # see `Camera`
+
+    def __str__(self) -> str:
+        return f"{self.cameras} of {self.width}x{self.height} pixels ({self.model})"
 
 
 class Camera:
@@ -323,10 +338,10 @@ class Camera:
         return camera
 
     @property
-    def form(self) -> tuple[Any, ...]:
+    def form(self) -> CameraForm:
         """What cameras must share to be drawn by the same graph."""
         size = (len(self), self.height, self.width)
-        return (*size, self.batched, self.model, self.distorted, self.window)
+        return CameraForm(*size, self.batched, self.model, self.distorted, self.window)
 
     def same(self, other: Camera) -> bool:
         """Whether another camera has the same rays; does not wait for a device."""

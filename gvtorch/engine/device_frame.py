@@ -16,14 +16,14 @@ from torch import Tensor
 from ..base.branches import in_branches
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..cache.requests import levels_wanted, nodes_to_subdivide
-from ..cache.write import Targets, WriteOutcome, put_bricks, put_tiles, put_uniform, write_rows
+from ..cache.write import Targets, put_bricks, put_tiles, put_uniform, write_rows
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import nearest_loadable, parent_bricks, without_repeats
 from .production import Production
 from .recorded import RecordedFrame
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
-from .stats import FrameStats, Readbacks
+from .stats import FrameStats
 
 
 class UncheckedAnswer(NamedTuple):
@@ -45,10 +45,7 @@ class DeviceFrame(RecordedFrame):
         self.deepen()
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Returns, before a frame, whether the listed requests are to be served. `stale`: another
-        frame was rendered since this graph's last one; `steady`: the newest frame that was read
-        back missed nothing, and the last replay did not look ahead.
-        """
+        """Returns whether the listed requests are to be served; see `RecordedFrame`."""
         if stale:
             self._requests.zero_()  # the listed requests are out of date: the rays ask again
         return not steady
@@ -62,7 +59,8 @@ class DeviceFrame(RecordedFrame):
             partial(self._ask_producers, REQUEST_LOAD, loads.node),
             partial(self._ask_producers, REQUEST_SUBDIVIDE, subdivisions.node),
         )
-        self._write_bricks(bricks)
+        for answer in bricks:
+            self._write_bricks(answer)
         self._subdivide(regions, *subdivisions)
 
     def deepen(self) -> None:
@@ -72,11 +70,9 @@ class DeviceFrame(RecordedFrame):
         chosen, priority = self._next_subdivisions.unbind(1)
         self._subdivide(self._ask_producers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
 
-    def extra_levels(self, readbacks: Readbacks) -> int:
-        """Returns how many more levels the last readback wanted on average; 0 if `by_level`."""
-        return 0 if self._production.by_level else readbacks.extra_levels
-
     def _count_levels(self) -> Tensor:
+        if self._production.by_level:
+            return super()._count_levels()
         request_word = self._requests[:, 1].flatten()
         priority = torch.where(
             (request_word & REQUEST_SUBDIVIDE) != 0, request_word & REQUEST_PRIORITY, -1
@@ -95,71 +91,45 @@ class DeviceFrame(RecordedFrame):
             answers.append(UncheckedAnswer(node, batch, batch.ask()))
         return answers
 
-    def _write_bricks(self, answers: Sequence[UncheckedAnswer]) -> None:
-        """Writes bricks."""
-        free_slots = self._unused_slots[1:]
-        for answer in answers:
-            counts, uniform_count, failed_count = self._check_and_put_bricks(answer, free_slots)
-            free_slots -= counts[1:2]
-            self._outcomes[1:2] += counts[1:2]
-            self._outcomes[2:3] += uniform_count
-            self._outcomes[4:5] += counts[2:]
-            self._outcomes[5:] += failed_count
-
     def _subdivide(
         self, answers: Sequence[UncheckedAnswer], chosen: Tensor, priority: Tensor
     ) -> None:
         """Subdivides nodes (batch,), and lists the children to subdivide next, in order."""
-        free_slots = self._unused_slots[:1]
         slot, child_priority = torch.full_like(chosen, -1), torch.zeros_like(chosen)
         for answer in answers:
             in_tree, source = answer.node >= 0, answer.batch.source
-            outcome, failed_count = self._check_and_put_tiles(answer, free_slots)
-            free_slots -= outcome.counts[1:2]
-            self._outcomes[:1] += outcome.counts[1:2]
-            self._outcomes[3:4] += outcome.counts[2:]
-            self._outcomes[5:] += failed_count
-            slot = torch.where(in_tree, outcome.slot, slot)
+            slot = torch.where(in_tree, self._write_tiles(answer), slot)
             child_priority = torch.where(
                 in_tree, priority // source.layout.branching, child_priority
             )
-        node, split = nodes_to_subdivide(self.cache, slot, child_priority, free_slots)
+        node, split = nodes_to_subdivide(self.cache, slot, child_priority, self._tiles.unused)
         rank = split.flatten().cumsum(0)
         rows = torch.stack((node, child_priority[:, None].expand_as(node)), 2).flatten(0, 1)
         self._next_subdivisions.fill_(-1)
         listed = split.flatten() & (rank <= self.batch)
         write_rows(self._next_subdivisions, torch.where(listed, rank - 1, -1), rows)
 
-    def _check_and_put_bricks(
-        self, unchecked: UncheckedAnswer, free_slots: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Loads nodes (k,). Returns `WriteOutcome.counts`, how many need no brick (1,), and how
-        many failed (1,).
-        """
+    def _write_bricks(self, unchecked: UncheckedAnswer) -> None:
+        """Checks bricks, writes them, and counts what was written and what failed."""
         node, batch, fill_answer = unchecked
         bricks = checked_bricks(fill_answer, batch.nodes, batch.source.producer, check_values=False)
         valid = _finite([bricks.data, bricks.constants], len(node), node.device)
-        has_data, uniform_count = valid, torch.zeros_like(node[:1])
+        has_data = valid
         if bricks.kind is not None:
-            has_data = (bricks.kind == Region.DATA) | (bricks.kind == Region.DATA_MAX_DEPTH)
             word = brick_words(bricks.kind)
-            uniform = word != ABSENT
-            valid, has_data, uniform = (
-                valid & (has_data | uniform),
-                valid & has_data,
-                valid & uniform,
-            )
+            uniform = valid & (word != ABSENT)
+            has_data = valid & (bricks.kind >= Region.DATA) & (bricks.kind <= Region.DATA_MAX_DEPTH)
+            valid = has_data | uniform
             targets = _masked_targets(batch.targets, node, uniform)
-            uniform_count = put_uniform(self.cache, targets, word, bricks.constants).view(1)
-        outcome = put_bricks(
-            self.cache, _masked_targets(batch.targets, node, has_data), bricks.data, free_slots
-        )
-        return outcome.counts, uniform_count, ((node >= 0) & ~valid).sum().view(1)
+            self._uniform_nodes.add_(put_uniform(self.cache, targets, word, bricks.constants))
+        targets = _masked_targets(batch.targets, node, has_data)
+        self._bricks.add(put_bricks(self.cache, targets, bricks.data, self._bricks.unused))
+        self._failed_nodes.add_(((node >= 0) & ~valid).sum())
 
-    def _check_and_put_tiles(
-        self, unchecked: UncheckedAnswer, free_slots: Tensor
-    ) -> tuple[WriteOutcome, Tensor]:
-        """Subdivides nodes (k,); returns the outcome, and how many failed (1,)."""
+    def _write_tiles(self, unchecked: UncheckedAnswer) -> Tensor:
+        """Checks regions, writes tiles, and counts what was written and what failed; returns the
+        tiles (k,), -1 for none.
+        """
         node, batch, classify_answer = unchecked
         regions = checked_regions(
             classify_answer, batch.nodes, batch.source.producer, check_values=False
@@ -169,10 +139,11 @@ class DeviceFrame(RecordedFrame):
         valid = valid & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)
         valid = valid.view(len(node), -1).all(1)
         children = children_of(batch, regions, self.cache)
-        outcome = put_tiles(
-            self.cache, _masked_targets(batch.targets, node, valid), children, free_slots
-        )
-        return outcome, ((node >= 0) & ~valid).sum().view(1)
+        targets = _masked_targets(batch.targets, node, valid)
+        outcome = put_tiles(self.cache, targets, children, self._tiles.unused)
+        self._tiles.add(outcome)
+        self._failed_nodes.add_(((node >= 0) & ~valid).sum())
+        return outcome.slot
 
     def _padded_batch(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
         """Returns the request batch of nodes (k,), with the root where the index is -1."""

@@ -1,5 +1,5 @@
 """`Engine`: renders scenes larger than memory, streaming what the rays request. `Engine.frame` is
-the method as one call per stage; the stages are defined below it.
+the method as one call per stage; steps.py defines the stages.
 
 Source: Crassin, Neyret, Lefebvre, Eisemann, "GigaVoxels: Ray-Guided Streaming for Efficient and
 Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
@@ -7,59 +7,33 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 
 from __future__ import annotations
 
-import threading
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial, wraps
 from typing import Any, Literal, TypeVar, Unpack, cast
 
-import torch
 from torch import Tensor
 
 from ..base import check
 from ..base.explicit import explicit
-from ..base.records import Hits, Rays, add
-from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
-from ..cache import Cache, RequestList, Scheduler
+from ..base.records import Hits, Rays
+from ..base.stage import Progress, no_progress
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..io.http import retry_refused
-from ..ops.trace import choose_backend
 from ..pictures import Picture
-from ..producers import Layout, Producer
 from ..shaders.shader import Shader
 from ..tracing import RenderOptions
 from ..tracing.options import RenderSettings, render_options
 from ..tracing.pixels import Again, View, empty_hits
-from ..tracing.trees import (
-    Shaders,
-    TreeTrace,
-    box_around,
-    overlaps,
-    trace_trees,
-    tree_traces,
-)
+from ..tracing.trees import Shaders, box_around, overlaps, tree_traces
 from .frame_graph import FrameGraph
 from .host_frame import HostFrame
-from .production import Failure, Production
-from .ray_subsets import RaySubsets, scouts
-from .renewal import renew_tree
-from .setup import (
-    EngineOptions,
-    EngineSettings,
-    brick_bytes,
-    make_pools,
-    make_recorded_frame,
-    make_tree,
-)
-from .stats import Collected, Counts, FrameStats, Readback, Readbacks, Report
+from .production import Failure
+from .ray_subsets import RaySubsets
+from .setup import EngineOptions, EngineSettings, make_recorded_frame
+from .stats import FrameStats, Report
+from .steps import FrameSteps, Scene
 
-Scene = Producer | Mapping[str, Producer]
-
-_MAX_LISTED_NODES = 1 << 17  # most nodes whose requests one frame lists
-_REPORTED_FRAMES = 1000  # most frames in a report
-_MAX_PRODUCED_BYTES = 256 * 10**6  # most bytes of voxels produced in one frame
 _Method = TypeVar("_Method", bound=Callable[..., Any])
 
 
@@ -67,14 +41,14 @@ def _locked(method: _Method) -> _Method:
     """Lets a method of an engine run in one thread at a time."""
 
     @wraps(method)
-    def run(self: Engine, *args: Any, **kwargs: Any) -> Any:
+    def run(self: FrameSteps, *args: Any, **kwargs: Any) -> Any:
         with self.lock:
             return method(self, *args, **kwargs)
 
     return cast("_Method", run)
 
 
-class Engine:
+class Engine(FrameSteps):
     """A scene of one or more trees in one pair of pools.
 
     Several threads may use an engine: they take turns, a picture at a time. A thread that does not
@@ -107,38 +81,7 @@ class Engine:
             ProductionError: A root can't be produced.
         """
         check.known_options("Engine", options, EngineSettings)
-        self.options, self.lock = EngineOptions(**options), threading.RLock()
-        self._rendering = False
-        self.device = check.device("Engine", self.options.device)
-        producers = dict(scene) if isinstance(scene, Mapping) else {"scene": scene}
-        for name in producers:
-            check.instance("Engine", "name of a tree", name, str)
-        nodes, bricks = make_pools(producers, self.options, self.device)
-        self.cache = Cache(nodes, bricks, len(producers))
-        max_loads = max(1, _MAX_PRODUCED_BYTES // brick_bytes(bricks.channels, self.options))
-        self.scheduler = Scheduler(
-            order=self.options.order,
-            loads=min(self.options.load_budget, max_loads),
-            subdivisions=self.options.subdivide_budget,
-            milliseconds=self.options.time_budget,
-        )
-        by_level = self.options.loading == "levels"
-        self.production = Production(self.cache, self.scheduler, by_level, self.options.strict)
-        self.trees = self.production.trees
-        self.readbacks = Readbacks()
-        self.frames, self._closed = 0, False
-        self._missed: Tensor | None = None  # (r,) bool, which rays of the last picture missed
-        self._recent_stats: deque[FrameStats] = deque(maxlen=_REPORTED_FRAMES)  # for the report
-        self._versions: dict[str, int] = {}  # of the content that the trees hold
-        self.host_frames: list[HostFrame] = []  # captured, with producers on the host
-        try:
-            layouts: dict[str, Layout] = {}
-            for name, producer in producers.items():
-                self.trees[name] = make_tree(self.cache, self.options, layouts, name, producer)
-                self._versions[name] = producer.version
-        except Exception:
-            self.close()
-            raise
+        super().__init__(scene, EngineOptions(**options))
 
     @explicit(RenderOptions)
     @_locked
@@ -187,168 +130,12 @@ class Engine:
         """Checks the arguments of `frame`, and returns its view. Errors begin with `context`."""
         camera = as_camera(context, camera)
         chosen = render_options(context, options, camera)
-        trees = {name: source.tree for name, source in self.trees.items()}
-        box = box_around(context, trees, chosen.pose)
-        placed, trace = camera.placed(box), partial(trace_trees, self._tracers(shader, chosen, box))
-        return View(placed, placed.numbers(self.device), trace, chosen, box)
-
-    def _tracers(self, shaders: Shaders, options: RenderOptions, box: Tensor) -> list[TreeTrace]:
-        """Returns a `TreeTrace` for each tree, given the (2, 3) box of the scene."""
         scene = {
             name: (source.tree, source.producer.channels) for name, source in self.trees.items()
         }
         by_level, frame_1 = self.production.by_level, self.cache.frame_1
-        return tree_traces(
-            "frame", scene, shaders, options, box, by_level=by_level, frame_1=frame_1
-        )
-
-    @contextmanager
-    def new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        """Collects the statistics of the frame that the block renders, and keeps other threads out.
-        If the block raises, only nodes whose answers are on their way stay marked as pending.
-        """
-        with self.lock:
-            if self._closed:
-                raise ValueError("Engine: it is closed")
-            if self._rendering:
-                raise RuntimeError("Engine: a frame within a frame: a producer or progress renders")
-            self._rendering = True
-            try:
-                yield from self._new_frame(options)
-            finally:
-                self._rendering = False
-
-    def _new_frame(self, options: RenderOptions) -> Iterator[FrameStats]:
-        stats = FrameStats(
-            frame=self.frames + 1,
-            backend=choose_backend(options.backend, self.device),
-            pending=sum(self.production.pending.values()),
-            failed=len(self.production.failures),
-        )
-        monitor, start = self.options.monitor, mark(self.device)
-        try:
-            with collect_timings(self.device) if monitor else nullcontext() as timings:
-                yield stats
-        except BaseException:
-            self.production.restore_pending()
-            raise
-        end = mark(self.device)
-
-        def complete() -> None:
-            stats.milliseconds += milliseconds(start, end)
-            if timings is not None:
-                add(stats.stages, timings.as_dict())
-
-        stats.later(complete)
-        if monitor:
-            self._recent_stats.append(stats)
-        self.production.failures.raise_if_strict()
-
-    def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
-        """Serves the requests of the last frame and writes answers that came late.
-
-        If the last frame's counts have not arrived, nothing is served now: rays ask again for what
-        they still miss. The host waits for the counts only if an earlier frame is known to have
-        requests, if an answer is due, if the host is too far ahead, or if `wait` is true.
-        """
-        self.renew()
-        self.release()
-        newest = self.readbacks.catch_up(wait or self.production.due)
-        if self.readbacks:
-            return
-        if newest is not None:  # nothing was written since it was traced: its nodes are still there
-            self.scheduler.begin()
-            self.production.serve(newest.requests, newest.wait(), stats)
-        with stage("write"):
-            self.production.write(self.production.late_answers(), stats)
-
-    def renew(self) -> None:
-        """Drops nodes and bricks that producers have reported as changed (`Producer.changed`), and
-        remakes the roots of their trees; the host waits for that. The next frames make the rest.
-        """
-        changed = [
-            source
-            for name, source in self.trees.items()
-            if source.producer.version != self._versions[name]
-        ]
-        if not changed:
-            return
-        self.release()
-        self.readbacks.catch_up(wait=True)  # their requests are dropped
-        for source in changed:
-            self.production.forget(source)
-            old_version, producer = self._versions[source.name], source.producer
-            renew_tree(self.cache, source, producer.changes(old_version))
-            self._versions[source.name] = producer.version
-        self._missed = None
-
-    def release(self, keep: HostFrame | None = None) -> None:
-        """Drops the answers that are on their way to captured frames, except those of `keep`."""
-        for host_frame in self.host_frames:
-            if host_frame is not keep:
-                host_frame.release()
-
-    def scout(self, view: View, stats: FrameStats) -> None:
-        """Traces some rays before the picture: while answers are written at once, some rays that
-        missed something are traced again, and what they miss next is served within this frame.
-
-        They carry the frame number of the last picture: no slot is given away that it or they used,
-        or that was written since. What exceeds the budgets or the pools is left to the whole
-        picture.
-        """
-        produced_count, hits = 0, None
-        for _ in range(self.options.scout_rounds):
-            if sum(stats.produced.values()) == produced_count or stats.capacity_exceeded:
-                break  # nothing new to see, or no room for more
-            produced_count = sum(stats.produced.values())
-            if hits is None:
-                hits = empty_hits(self.device, view.options.dtype, view.ray_count)
-                if self._missed is not None and len(self._missed) == view.ray_count:
-                    hits.missed.copy_(self._missed)
-            view.hits(again=(hits, scouts(hits.missed, view.camera.width)))
-            collected = self.collect_requests_and_use(hits.samples[:0])
-            counts = Counts(*collected.numbers.tolist())  # waits: this frame misses something
-            add(stats.requests, counts.by_kind())
-            self.production.serve(collected.requests, counts, stats)
-
-    def trace(
-        self, view: View, progress: Progress = no_progress, again: Again | None = None
-    ) -> Hits:
-        """Traces a picture's rays, all or some of them `again`, under a new frame number."""
-        self.number_picture()
-        return view.hits(progress, again=again)
-
-    def number_picture(self, on_device: bool = True) -> None:
-        """Gives the next picture its number, with which rays stamp what they use. Recorded frames
-        count on the device themselves; for all others it is written there (`on_device`).
-        """
-        self.frames += 1
-        if on_device:
-            self.cache.frame_1.fill_(self.frames)
-        for source in self.trees.values():
-            source.tree.frame = self.frames
-
-    def collect_requests_and_use(self, samples: Tensor) -> Collected:
-        """Lists the requests of a traced frame and clears their words, sorts the slots by use, and
-        counts both and the sum of (r,) samples; all results stay on the device.
-        """
-        with stage("requests"):
-            capacity = min(_MAX_LISTED_NODES, self.cache.nodes.child_tn.numel())
-            requests = RequestList.collect(self.cache, capacity)
-        with stage("lru"):
-            use = self.cache.sort_by_use()
-        with stage("count"):
-            sample_count = samples.sum(dtype=torch.int64).view(1)
-            return Collected(requests, torch.cat((requests.count, use, sample_count)))
-
-    def read_back(self, stats: FrameStats, hits: Hits, collected: Collected) -> None:
-        """Starts copying a frame's counts to the host; until they arrive no slot may be taken."""
-        nodes, bricks = self.cache.nodes, self.cache.bricks
-        stats.nodes, stats.bricks = nodes.child_tn.numel(), bricks.capacity
-        stats.rays, stats.bytes = len(hits.missed), nodes.nbytes + bricks.nbytes
-        self._missed = hits.missed
-        self.cache.make_room(0, 0)
-        self.readbacks.append(Readback(stats, collected, self.readbacks))
+        trees = tree_traces(context, scene, shader, chosen, by_level=by_level, frame_1=frame_1)
+        return View.of(camera, trees, chosen)
 
     @explicit(RenderOptions)
     @_locked
@@ -499,7 +286,7 @@ class Engine:
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         view = self.view("capture", camera, shader, options)
-        if overlaps(self._tracers(shader, view.options, view.box)):
+        if overlaps(view.trees):
             raise ValueError(
                 "Engine.capture: trees that overlap can't be recorded: the host waits for them"
             )
@@ -520,22 +307,10 @@ class Engine:
             self.host_frames.append(recorded)
         return FrameGraph(self, view, recorded, render_frame, look_ahead)
 
-    @property
-    def steady(self) -> bool:
-        """True if the newest frame read back missed nothing; does not block."""
-        return self.readbacks.steady
-
-    @property
-    def changed(self) -> bool:
-        """Whether a producer's content has changed since its tree was last renewed."""
-        return any(
-            source.producer.version != self._versions[name] for name, source in self.trees.items()
-        )
-
     @cached_property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners around all trees, without any pose."""
-        return box_around("Engine", {name: source.tree for name, source in self.trees.items()})
+        return box_around([source.tree.box for source in self.trees.values()])
 
     @property
     def failures(self) -> list[Failure]:
@@ -567,19 +342,6 @@ class Engine:
         for source in self.trees.values():
             source.tree.validate()
         self.cache.validate()
-
-    def close(self) -> None:
-        """Waits for the frame that another thread is rendering, then drops all answers on their way
-        and closes the producers' files and threads.
-        """
-        self._closed = True  # another thread's picture gets no further frame
-        with self.lock:
-            for host_frame in self.host_frames:
-                host_frame.close()
-            self.production.close()
-            for source in self.trees.values():
-                source.producer.close()
-                source.producer.layout = None
 
     def __enter__(self) -> Engine:
         return self

@@ -4,50 +4,26 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..base.stage import stage
-from ..cache import Cache
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..pictures import Picture
-from ..tracing import RenderOptions
 from ..tracing.pixels import View
 from .device_frame import DeviceFrame
-from .host_frame import HostFrame
-from .stats import Collected, FrameStats, Readbacks
+from .recorded import RecordedFrame
+from .stats import Collected, FrameStats
+from .steps import FrameSteps
 
 _STRIDE = 4  # pixels between look-ahead rays
 _MAX_INTERVAL = 4  # most frames between two look-aheads
 _LOOKS_AHEAD = 4  # look-aheads before the camera arrives: each deepens a tree by a level
-
-
-class Steps(Protocol):
-    """The steps of a frame, which `Engine` implements."""
-
-    device: torch.device
-    frames: int
-    cache: Cache
-    readbacks: Readbacks
-
-    @property
-    def lock(self) -> Any: ...
-    @property
-    def steady(self) -> bool: ...
-    @property
-    def changed(self) -> bool: ...
-    def new_frame(self, options: RenderOptions) -> AbstractContextManager[FrameStats]: ...
-    def release(self, keep: HostFrame | None = None) -> None: ...
-    def number_picture(self, on_device: bool = True) -> None: ...
-    def collect_requests_and_use(self, samples: Tensor) -> Collected: ...
-    def read_back(self, stats: FrameStats, hits: Hits, collected: Collected) -> None: ...
 
 
 class FrameGraph:
@@ -68,9 +44,9 @@ class FrameGraph:
 
     def __init__(
         self,
-        engine: Steps,
+        engine: FrameSteps,
         view: View,
-        recorded: DeviceFrame | HostFrame | None,
+        recorded: RecordedFrame | None,
         render_frame: Callable[[Camera | Rays], tuple[Picture, FrameStats]],
         look_ahead: float = 0,
     ) -> None:
@@ -88,8 +64,11 @@ class FrameGraph:
             with _record_graph(self._deepen, engine.device):
                 recorded.deepen()
         with _record_graph(self._draw, engine.device):
-            looks_ahead = self._look_ahead is not None
-            self._hits = view.hits() if recorded is None else recorded.draw(view, looks_ahead)
+            if recorded is None:
+                engine.cache.frame_1.add_(1)
+                self._hits = view.hits()
+            else:
+                self._hits = recorded.draw(view, self._look_ahead is not None)
             self._picture = view.picture(self._hits, FrameStats())
             if self._look_ahead is None:
                 self._collected = self._collect()
@@ -118,46 +97,40 @@ class FrameGraph:
             ValueError: The camera differs in number, size or model, or the engine is closed.
         """
         camera = as_camera("replay", camera)
-        form, captured = camera.form, self._view.camera.form
-        if form != captured:
-            raise ValueError(
-                f"replay: camera must be {captured[0]} of {captured[2]}x{captured[1]} pixels as "
-                f"captured ({captured[4]}), got {form[0]} of {form[2]}x{form[1]} ({form[4]})"
-            )
+        captured = self._view.camera.form
+        if camera.form != captured:
+            raise ValueError(f"replay: camera must be {captured} as captured, got {camera.form}")
         with self._engine.lock:
             return self._replay(camera)
 
     def _replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
         """See `replay`."""
-        engine, recorded = self._engine, self._recorded
-        if engine.changed:
-            return self._render_frame(camera)  # which renews the changed trees
-        if recorded is not None and (
-            engine.readbacks.failed or recorded.host_needed or len(engine.cache.aliases)
-        ):
-            recorded.host_needed = False
-            # `Engine.frame` names the nodes that fail, and requests targets of aliases.
-            return self._render_frame(camera)
+        engine, recorded, collected = self._engine, self._recorded, self._collected
+        if engine.changed or (recorded and recorded.take_host_needed(engine.readbacks)):
+            return self._render_frame(camera)  # which also renews the changed trees
         with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
             stale = engine.frames != self._frame_number
             if recorded is not None:
-                engine.release(keep=recorded if isinstance(recorded, HostFrame) else None)
-                engine.readbacks.take_arrived()
-                steady = engine.steady and not (self._look_ahead and self._look_ahead.due)
-                with stage("serve"):
-                    if recorded.begin(stale, steady, stats):
-                        self._serve.replay()
-                        for _ in range(recorded.extra_levels(engine.readbacks)):
-                            self._deepen.replay()
-            engine.number_picture(on_device=recorded is None)
+                self._serve_missed(recorded, stale, stats)
+                collected = recorded.to_read_back(collected)
+            engine.number_picture()
             self._frame_number = engine.frames
             self._draw_from(camera.placed(self._view.box), stale)
-            collected = self._collected
-            if isinstance(recorded, HostFrame):
-                collected = collected._replace(ask=partial(recorded.ask, recorded.generation))
             engine.read_back(stats, self._hits, collected)
         engine.readbacks.hold_back()
         return replace(self._picture, stats=stats), stats
+
+    def _serve_missed(self, recorded: RecordedFrame, stale: bool, stats: FrameStats) -> None:
+        """Serves what earlier replays missed; `stale`: other frames came since the last one."""
+        engine = self._engine
+        engine.release(keep=recorded)
+        engine.readbacks.take_arrived()
+        steady = engine.steady and not (self._look_ahead and self._look_ahead.due)
+        with stage("serve"):
+            if recorded.begin(stale, steady, stats):
+                self._serve.replay()
+                for _ in range(engine.readbacks.extra_levels):
+                    self._deepen.replay()
 
     def _draw_from(self, camera: Camera, stale: bool) -> None:
         """Draws what a placed camera sees; `stale`: other frames came since the last replay."""

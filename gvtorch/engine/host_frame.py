@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import torch
@@ -30,7 +31,7 @@ from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
 from .mail import Mail, RowForm
 from .production import Production
-from .recorded import RecordedFrame
+from .recorded import RecordedFrame, SlotCounts
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import Collected, FrameStats
 
@@ -71,13 +72,12 @@ class HostFrame(RecordedFrame):
         )
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Sends, before a frame, the answers that were posted, and returns whether there are any:
-        then `serve` is to write them. `stale`: another frame was rendered since this graph's last
-        one, so the counts of unused slots are out of date.
+        """Sends the answers that were posted, and returns whether there are any; see
+        `RecordedFrame`.
         """
         self.active = True
         if stale:
-            self._unused_slots.zero_()
+            self._unused_slots.zero_()  # the counts are out of date
         self._fail_overdue()
         self._schedule_ask()
         sent = [mail.send() for mail in self._mail]
@@ -129,6 +129,9 @@ class HostFrame(RecordedFrame):
         rows = torch.cat((node[:, None], tree_number[:, None].to(torch.int64), loc), 1)
         return collected._replace(numbers=torch.cat((collected.numbers, rows.flatten())))
 
+    def to_read_back(self, collected: Collected) -> Collected:
+        return collected._replace(ask=partial(self.ask, self.generation))
+
     def _write_answers(self, source: ProducedTree, mail: Mail) -> None:
         """Writes the answers sent for one tree; nodes that found no slot may be requested again."""
         tiles, bricks, uniform, to_host = (
@@ -146,25 +149,21 @@ class HostFrame(RecordedFrame):
         targets = [
             Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, uniform)
         ]
-        outcome = put_tiles(self.cache, targets[0], children, self._unused_slots[:1])
-        self._count_outcome(REQUEST_SUBDIVIDE, targets[0], outcome, 0)
+        outcome = put_tiles(self.cache, targets[0], children, self._tiles.unused)
+        self._count_outcome(REQUEST_SUBDIVIDE, self._tiles, targets[0], outcome)
         outcome = put_bricks(
-            self.cache, targets[1], _by_channel(bricks, "data"), self._unused_slots[1:]
+            self.cache, targets[1], _by_channel(bricks, "data"), self._bricks.unused
         )
-        self._count_outcome(REQUEST_LOAD, targets[1], outcome, 1)
-        self._outcomes[2] += put_uniform(
-            self.cache, targets[2], uniform["word"], _by_channel(uniform, "constants")
-        )
+        self._count_outcome(REQUEST_LOAD, self._bricks, targets[1], outcome)
+        constants = _by_channel(uniform, "constants")
+        self._uniform_nodes.add_(put_uniform(self.cache, targets[2], uniform["word"], constants))
         self._clear_pending(to_host["node"], to_host["bit"])
         mail.clear()
 
     def _count_outcome(
-        self, kind: int, targets: Targets, outcome: WriteOutcome, index: int
+        self, kind: int, slots: SlotCounts, targets: Targets, outcome: WriteOutcome
     ) -> None:
-        _, placed, evicted = outcome.counts
-        self._unused_slots[index] -= placed
-        self._outcomes[index] += placed
-        self._outcomes[3 + index] += evicted
+        slots.add(outcome)
         unplaced = torch.where(outcome.wanted & (outcome.slot < 0), targets.node, -1)
         bit = torch.full_like(unplaced, kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
         self._clear_pending(unplaced, bit)

@@ -4,6 +4,7 @@ written in batches of fixed size, so that every shape is known beforehand; unuse
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,11 +16,11 @@ from ..base.constants import REQUEST_KINDS, REQUEST_PENDING_SHIFT
 from ..base.records import Hits
 from ..cache import RequestList
 from ..cache.requests import MAX_EXTRA_LEVELS
-from ..cache.write import write_rows
+from ..cache.write import WriteOutcome, write_rows
 from ..ops import choose_requests
 from ..tracing.pixels import View
 from .production import Production
-from .stats import COARSER_UNIT, Collected, Readbacks
+from .stats import COARSER_UNIT, Collected, FrameStats, Readbacks
 
 _MAX_LISTED_NODES = 1 << 14  # most nodes whose requests are listed, unless a batch holds more
 # Factors: most by which a frame widens cones, by which it narrows them, and widest cones.
@@ -35,9 +36,24 @@ class Chosen(NamedTuple):
     priority: Tensor  # (batch,) int32 width of one of its voxels on the screen, 1/16 pixel
 
 
-class RecordedFrame:
-    """What `DeviceFrame` and `HostFrame` share. A frame is `draw`, then `look_ahead` where its
-    camera moves, then `finish`.
+class SlotCounts(NamedTuple):
+    """Counts of tiles or of bricks, each (1,) int64 on the device, part of a longer tensor."""
+
+    unused: Tensor  # slots that may be taken
+    made: Tensor  # slots written since the last frame
+    evicted: Tensor  # of these, the slots that held something else
+
+    def add(self, outcome: WriteOutcome) -> None:
+        """Counts a write."""
+        _, placed, evicted = outcome.counts
+        self.unused.sub_(placed)
+        self.made.add_(placed)
+        self.evicted.add_(evicted)
+
+
+class RecordedFrame(ABC):
+    """What `DeviceFrame` and `HostFrame` share. A frame is `serve` if `begin` says so, `draw`, then
+    `look_ahead` where its camera moves, then `finish`.
 
     Attributes:
         batch: Most bricks, and most node tiles, that are chosen in a frame.
@@ -56,13 +72,38 @@ class RecordedFrame:
         # Requests of the last picture, and of the look-ahead: nodes and their words.
         self._requests = torch.zeros((2, 2, self._list_capacity), dtype=torch.int32, device=device)
         self._unused_slots = torch.zeros(2, dtype=torch.int64, device=device)  # tiles, bricks
-        # Counts since the last frame: tiles and bricks made, nodes that need none, tiles and bricks
-        # replaced, nodes failed.
+        # Counts since the last frame, from `tiles` to `failed` in the order of `Counts`.
         self._outcomes = self._unused_slots.new_zeros(6)
+        made, self._uniform_nodes, evicted, self._failed_nodes = self._outcomes.split((2, 1, 2, 1))
+        pairs = (self._unused_slots, made, evicted)  # tiles, bricks
+        self._tiles, self._bricks = map(SlotCounts, *(pair.split(1) for pair in pairs))
         self._zero = self._unused_slots.new_zeros(1)
         self._fit = fit
         # Factor by which cones are wider than the camera's, so that a view fits the pools.
         self._cone_factor = torch.ones(1, dtype=torch.float64, device=device)
+
+    @abstractmethod
+    def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
+        """Returns, before a frame, whether `serve` is to run.
+
+        Args:
+            stale: Another frame was rendered since this graph's last one.
+            steady: The newest frame that was read back missed nothing, and the last replay did not
+                look ahead.
+            stats: Of this frame.
+        """
+
+    @abstractmethod
+    def serve(self) -> None:
+        """Writes what earlier frames missed."""
+
+    def take_host_needed(self, readbacks: Readbacks) -> bool:
+        """Returns whether `Engine.frame` must render the next frame, which names the nodes that
+        fail and requests targets of aliases; once for each answer that `host_needed` is about.
+        """
+        needed = readbacks.failed or self.host_needed or len(self.cache.aliases) > 0
+        self.host_needed = False
+        return needed
 
     def draw(self, view: View, looks_ahead: bool = False) -> Hits:
         """Traces the picture, and lists its requests. `looks_ahead`: `look_ahead` may follow."""
@@ -92,19 +133,16 @@ class RecordedFrame:
         torch.stack((listed.node, listed.word), out=self._requests[list_index])
         return listed
 
-    def extra_levels(self, readbacks: Readbacks) -> int:
-        """Returns how many times `DeviceFrame.deepen` is to follow `serve`."""
-        return 0
-
     def finish(self, hits: Hits) -> Collected:
         """Sorts slots by use and counts; those used are the picture's, without `look_ahead`'s."""
         use, samples = in_branches(
             self.cache.sort_by_use, lambda: hits.samples.sum(dtype=torch.int64).view(1)
         )
+        unused, used = use[:4].view(2, 2).unbind(1)  # of tiles and bricks
         ahead_count = self._zero
-        self._unused_slots.copy_(use[0:4:2])
+        self._unused_slots.copy_(unused)
         if self._looks_ahead:
-            use[1:4:2] = self._picture_use
+            used.copy_(self._picture_use)
             ahead_count = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
         counts = (
             self._listed.count,
@@ -116,21 +154,26 @@ class RecordedFrame:
         )
         numbers = torch.cat((*counts, (self._cone_factor * COARSER_UNIT).to(torch.int64)))
         if self._fit:
-            self._widen_cones(use, self._listed.count)
+            self._widen_cones(used, self._listed.count)
         self._outcomes.zero_()
         return Collected(self._listed, numbers)
 
-    def _widen_cones(self, use: Tensor, request_counts: Tensor) -> None:
+    def to_read_back(self, collected: Collected) -> Collected:
+        """Returns what `finish` left, with what the host is to do once it has this frame's."""
+        return collected
+
+    def _widen_cones(self, used: Tensor, request_counts: Tensor) -> None:
         """Widens the next frame's cones if the pools can't hold what this one used and requested,
         and narrows them again, down to the camera's, if there is room. A surface needs bricks in
-        proportion to the inverse square of the cones' width. `use` is from `Cache.sort_by_use`,
-        `request_counts` from `compact_requests`: every requested node, pending or not, may need a
-        brick.
+        proportion to the inverse square of the cones' width. `used` (2,) counts tiles and bricks,
+        `request_counts` is from `compact_requests`: every requested node, pending or not, may need
+        a brick.
         """
-        nodes, bricks = self.cache.nodes.capacity, self.cache.bricks.capacity
-        needed = torch.stack(
-            ((use[3] + request_counts[2]) / bricks, (use[1] + request_counts[4]) / nodes)
-        ).amax()
+        tiles_used, bricks_used = used
+        _, _, missed_nodes, _, subdivisions = request_counts
+        needed_bricks = (bricks_used + missed_nodes) / self.cache.bricks.capacity
+        needed_tiles = (tiles_used + subdivisions) / self.cache.nodes.capacity
+        needed = torch.stack((needed_bricks, needed_tiles)).amax()
         wider = self._cone_factor * torch.where(
             needed > 1, needed.sqrt().clamp(max=_MAX_WIDENING), 1.0
         )
@@ -138,7 +181,7 @@ class RecordedFrame:
         self._cone_factor.copy_(narrower.clamp(1.0, _MAX_CONE_FACTOR))
 
     def _count_levels(self) -> Tensor:
-        """Returns `levels_wanted` of the requests; 0 where frames deepen by one level only."""
+        """Returns `levels_wanted` of the requests; zeros where frames deepen by one level only."""
         return self._zero.expand(1 + MAX_EXTRA_LEVELS)
 
     def choose(self) -> tuple[Chosen, Chosen]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from copy import copy
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, Unpack
 
 import torch
 
@@ -27,7 +27,7 @@ from ..ops.shading import (
     pack,
 )
 from ..pool import Channel, N3Tree
-from .lights import LitShader, a_number, a_triple
+from .lights import LightSettings, LitShader, a_number, a_triple
 from .shader import ColorTable, CutSurface, Sampling, Shader, number_of_one, one_color
 from .transfer_function import TransferFunction, integrated_table
 
@@ -74,7 +74,7 @@ class Lit(LitShader):
         *,
         shadows: bool = False,
         in_the_way: Shader | None = None,
-        **light: Any,
+        **light: Unpack[LightSettings],
     ) -> None:
         """See the class.
 
@@ -89,6 +89,10 @@ class Lit(LitShader):
         """
         super().__init__(**light)
         self.transfer, self.shadows, self.in_the_way = transfer, shadows, in_the_way
+
+    @property
+    def shows_nothing(self) -> bool:
+        return self.transfer.shows_nothing
 
     def blocker(self) -> Shader:
         return self.in_the_way or self.transfer
@@ -134,7 +138,7 @@ class StoredColor(LitShader):
         premultiplied: bool = False,
         lit: bool = False,
         shadows: bool = False,
-        **light: Any,
+        **light: Unpack[LightSettings],
     ) -> None:
         """See the class.
 
@@ -195,6 +199,15 @@ class StoredColor(LitShader):
         return super().shading(context, tree)
 
 
+class SurfaceSettings(LightSettings, total=False):
+    """The keyword arguments of `Isosurface`, for `DistanceField`, which passes them on."""
+
+    color_channel: str | None
+    color_component: int
+    premultiplied: bool
+    filled: bool
+
+
 class Isosurface(LitShader):
     """The first point of a ray where the value crosses a level, drawn opaque and lit. The solid is
     where the value is not below the level; it is filled, so its inside is seen where the scene's
@@ -224,7 +237,7 @@ class Isosurface(LitShader):
         color_component: int = 0,
         premultiplied: bool = False,
         filled: bool = True,
-        **light: Any,
+        **light: Unpack[LightSettings],
     ) -> None:
         """Sets the level and how the surface looks.
 
@@ -319,7 +332,7 @@ class DistanceField(Isosurface):
         color: Triple | TransferFunction | None = (0.8, 0.8, 0.8),
         *,
         offset: Number = 0.0,
-        **look: Any,
+        **look: Unpack[SurfaceSettings],
     ) -> None:
         """See `Isosurface` for how the surface looks; `offset` is in the unit of the field."""
         super().__init__(offset, color, **look)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from ..ops import ShadeArguments
 from ..ops.registry import add_user_op
 from ..ops.shading import Number, pack
 from ..pool import N3Tree
-from .lights import LitShader
+from .lights import LightSettings, LitShader
 from .transfer_function import TransferFunction
 
 Uniforms = MutableMapping[str, Number] | Tensor
@@ -52,7 +52,7 @@ class CompiledShader(LitShader):
         component: int | None = None,
         other: str | None = None,
         other_component: int = 0,
-        **light: Any,
+        **light: Unpack[LightSettings],
     ) -> None:
         """Compiles the struct for the CPU, which takes seconds unless it is cached, and loads it.
         It is compiled for CUDA when it is first used with a tree on CUDA.

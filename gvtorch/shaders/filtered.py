@@ -341,6 +341,13 @@ class Filtered(Shader):
     def material(self) -> ShadeParameters:
         return self.transfer.material()
 
+    @property
+    def shows_nothing(self) -> bool:
+        return self.transfer.shows_nothing
+
+    def own_light(self) -> Any:
+        return self.transfer.own_light()
+
     def unlit(self) -> Shader:
         if not isinstance(self.transfer, Lit):
             return super().unlit()

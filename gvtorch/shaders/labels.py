@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar, Unpack
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from ..base.image_info import array_from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
-from .lights import LitShader
+from .lights import LightSettings, LitShader
 from .shader import ColorTable, Sampling
 
 BACKGROUND = 0
@@ -57,7 +57,7 @@ class Labels(LitShader):
         channel: str | None = None,
         reference: float | None = None,
         lit: bool = True,
-        **light: Any,
+        **light: Unpack[LightSettings],
     ) -> None:
         """See the class.
 
@@ -78,7 +78,7 @@ class Labels(LitShader):
         """
         if "normals" in light:
             raise ValueError("Labels: normals are those of the labels, got normals")
-        super().__init__(**{"ambient": 0.3, "diffuse": 0.7, "specular": 0.15, **light})
+        super().__init__(**LightSettings(ambient=0.3, diffuse=0.7, specular=0.15) | light)
         if isinstance(visible, Iterator):  # it could be iterated only once
             visible = [*visible]
         self.colors, self.opacity, self.visible = colors, opacity, visible

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from math import inf
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypedDict
 
 import numpy as np
 import torch
@@ -143,6 +143,19 @@ _MATERIAL = ("ambient", "diffuse", "specular", "shininess", "octaves", "anisotro
 MOST_OCTAVES = 5
 
 
+class LightSettings(TypedDict, total=False):
+    """The keyword arguments of `LitShader`, for constructors that pass them on."""
+
+    normals: str | None
+    light: Light | None
+    ambient: Number
+    diffuse: Number
+    specular: Number
+    shininess: Number
+    octaves: int
+    anisotropy: Number
+
+
 class LitShader(Shader):
     """A shader with a light and a material (Blinn, 1977): base colour * (ambient + diffuse * cosine
     * light) + specular * cosine^shininess * light.
@@ -212,6 +225,9 @@ class LitShader(Shader):
                 f"{context}: octaves of scattering need a sun or lamp, got a Headlight"
             )
         return arguments._replace(shader=shader_number(self.shadowed_kind))
+
+    def own_light(self) -> Light:
+        return self.light
 
     def unlit(self) -> Self:
         unlit = copy(self)

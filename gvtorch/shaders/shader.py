@@ -234,6 +234,11 @@ class Shader(Checked):
     # For the effects around it. Those for lighting raise ValueError for unsuitable shaders.
 
     @property
+    def shows_nothing(self) -> bool:
+        """Whether its transfer function hides every value, so that no ray needs to be traced."""
+        return False
+
+    @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
         """Which value along a ray it shows. Results of a ray's pieces are joined by this rule;
         None: they are composited.
@@ -254,6 +259,10 @@ class Shader(Checked):
             "render: lighting needs normals: the shader must be Lit, StoredColor, Isosurface or "
             f"DistanceField, got {type(self).__name__}"
         )
+
+    def own_light(self) -> Any:
+        """Returns its light, for a `Lighting` without lights; None if it has none."""
+        return None
 
     def matter(self) -> Shader:
         """Returns the shader for wide cones of indirect light: base colours, alpha, normals."""

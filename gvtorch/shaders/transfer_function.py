@@ -197,6 +197,10 @@ class TransferFunction(Shader):
         channels = [np.interp(value, self.color[:, 0], self.color[:, i]) for i in (1, 2, 3)]
         return np.stack([*channels, np.interp(value, *self.opacity.T)], axis=-1)
 
+    @property
+    def shows_nothing(self) -> bool:
+        return not self.opacity[:, 1].any()
+
     def corners(self) -> tuple[float, float, np.ndarray]:
         """Returns the first and last value of a table, and (k,) positions of the corner points
         between them, 0 to 1.

@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.camera import Frame
-from .composite import TraceRays, indices_if_few, scatter_hits, trace_pieces
+from .composite import TraceRays, indices_if_few, reaches_depth, scatter_hits, trace_pieces
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
@@ -243,8 +243,7 @@ class Clipped:
         feature_scale = before * alpha / absorbed
         scale = before * alpha * light.to(before) / absorbed
         after = before * (1 - alpha)
-        hit_clear = 1 - self.depth_alpha
-        hit = (after < hit_clear) & (before >= hit_clear)
+        hit = reaches_depth(before, after, self.depth_alpha)
         return Hits(
             color=slab.color * scale[:, None],
             alpha=(1 - after)[:, None],

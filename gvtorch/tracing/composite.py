@@ -6,7 +6,7 @@ Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -64,9 +64,43 @@ def nothing_like(field: Tensor, rays: int) -> Tensor:
     return field.new_full(shape, -1 if field.dtype == torch.int64 else 0)
 
 
+def columns_of(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
+    """Returns a field (r, ...) of all `hits`, zeros or -1 where one lacks it; None if all do."""
+    fields = [getattr(tree_hits, name) for tree_hits in hits]
+    present = [field for field in fields if field is not None]
+    if not present:
+        return None
+    if len({field.shape[1:] for field in present}) > 1:
+        raise ValueError("render: all trees must give the same number of features")
+    return [
+        nothing_like(present[0], len(tree_hits.alpha)) if field is None else field
+        for tree_hits, field in zip(hits, fields, strict=True)
+    ]
+
+
+def join_hits(parts: Sequence[Hits], indices: Sequence[Tensor]) -> Hits:
+    """Joins hits to (r,); each of `parts` holds those at its indices `indices` (k,)."""
+    if len(parts) == 1:
+        return parts[0]
+    order = torch.cat(list(indices)).argsort()
+    fields = {}
+    for name in vars(parts[0]):
+        if (columns := columns_of(parts, name)) is not None:
+            fields[name] = torch.cat(columns)[order]
+    return Hits(**fields)
+
+
 def behind(rays: Rays, front: Hits) -> Rays:
     """Returns the rays with the transmittance that `front` leaves."""
     return replace(rays, transmittance=1 - front.alpha[:, 0].to(torch.float64))
+
+
+def reaches_depth(before: Tensor, after: Tensor, depth_alpha: float) -> Tensor:
+    """Returns (k,) bool, in which parts of rays alpha passes `depth_alpha`, so that the depth lies
+    there, given the transmittance before and after each part (k,).
+    """
+    hit_clear = 1 - depth_alpha
+    return (before >= hit_clear) & (after < hit_clear)
 
 
 def indices_if_few(mask: Tensor) -> Tensor | None:

@@ -23,11 +23,10 @@ from ..pool import N3Tree
 from ..shaders.module import TransferModule
 from ..shaders.shader import Shader
 from ..shaders.transfer_function import TransferFunction
-from .effects import with_effects
+from .effects import TreeTrace
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import View, tree_stats, using
 from .tracer import Batch, Tracer, march
-from .trees import box_around
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
 IMAGES = get_args(Image)
@@ -124,12 +123,10 @@ def cost(
     check.instance("cost", "tree", tree, N3Tree)
     transfer = check.instance("cost", "shader", shader, TransferFunction)
     start = time.perf_counter()
-    box = box_around("cost", {"": tree}, chosen.pose)
-    placed = camera.placed(box)
     counter = _Counter(tree, transfer, chosen)
-    trace_rays = with_effects(counter, chosen, box)
-    numbers = placed.numbers(tree.device)
-    view = View(placed, numbers, lambda rays: trace_rays(counter.begin(rays)), chosen, box)
+    counted = TreeTrace.of(counter, chosen)
+    numbered = replace(counted, trace=lambda rays: counted.trace(counter.begin(rays)))
+    view = View.of(camera, [numbered], chosen)
     with using("cost", [tree]):
         columns = [
             (hits.samples, counter.take_nodes(), *_means(hits))

@@ -1,9 +1,11 @@
-"""Wraps a tree's tracer in the effects of the options: depth of field, clip, lighting."""
+"""`TreeTrace`: a tree's tracer, wrapped in the effects of the options: depth of field, clip,
+lighting.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -11,15 +13,46 @@ from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
-from ..shaders.filtered import Filtered
-from ..shaders.lights import LitShader
 from ..shaders.shader import CutSurface, Shader
 from .clip import Clipped
-from .composite import TraceRays, tree_span
+from .composite import TraceRays, box_span, tree_span
 from .lighting import Lighted
 from .options import RenderOptions
+from .pose import world_box
 from .thin_lens import ThinLens, ThroughLens
 from .tracer import Tracer
+
+
+@dataclass(frozen=True, eq=False)
+class TreeTrace:
+    """The tracers of a tree."""
+
+    box: Tensor  # (2, 3) float64 world corners around the tree
+    trace: TraceRays  # the tracer, wrapped by `with_effects`
+    tracer: Tracer  # the tree alone
+
+    @classmethod
+    def of(
+        cls, tracer: Tracer, options: RenderOptions, scene_box: Tensor | None = None
+    ) -> TreeTrace:
+        """Wraps a tracer; `scene_box` (2, 3) is for scenes that hold more than its tree."""
+        box = world_box(tracer.tree.box, tracer.pose)
+        trace = with_effects(tracer, options, box if scene_box is None else scene_box)
+        return cls(box, trace, tracer)
+
+
+def box_spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
+    """Returns (m, r, 2) distances of rays in the trees' boxes; last < first where they miss."""
+    spans = []
+    for tree in trees:
+        tree_rays = tree.tracer.to_tree(rays)
+        low, high = pack(
+            (tree.tracer.tree.box,), tree_rays.origin.dtype, tree_rays.origin.device
+        ).view(2, 3)
+        first, last = box_span(low, high, tree_rays.origin, tree_rays.direction)
+        near, far = rays.range.to(first).unbind(1)
+        spans.append(torch.stack((torch.maximum(first, near), torch.minimum(last, far)), 1))
+    return torch.stack(spans)
 
 
 def with_effects(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRays:
@@ -35,8 +68,6 @@ def with_effects(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRa
         return _clipped(tracer, options, box, lens)
     shader = tracer.shader
     unlit = _clipped(tracer.with_shader(shader.unlit(), options), options, box, lens)
-    lit_shader = shader.transfer if isinstance(shader, Filtered) else shader
-    assert isinstance(lit_shader, LitShader)  # others raise
     lights = options.lighting.lights
     cone_options = replace(options, lod="auto")
     matter = None
@@ -48,7 +79,7 @@ def with_effects(tracer: Tracer, options: RenderOptions, box: Tensor) -> TraceRa
         blocker=_clipped(tracer.with_shader(shader.blocker(), cone_options), options, box),
         matter=matter,
         lighting=options.lighting.placed(box),
-        lights=(lit_shader.light,) if lights is None else lights,
+        lights=(shader.own_light(),) if lights is None else lights,
         material=shader.material(),
         voxel=max(tracer.tree.spacing),
         cone_scale=options.cone_scale,

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property
 from os import PathLike
 from typing import Any, Unpack
 
@@ -27,8 +27,8 @@ from ..ops.trace import choose_backend
 from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree
-from .composite import TraceRays, nothing_like
-from .effects import with_effects
+from .composite import nothing_like
+from .effects import TreeTrace
 from .options import RenderOptions, RenderSettings, render_options
 from .tracer import Tracer
 from .trees import Shaders, box_around, trace_trees, tree_traces
@@ -82,10 +82,9 @@ def render(
     device, start = trees[0].device, time.perf_counter()
     with using("render", trees), collect_timings(device) as timings:
         with stage("prepare"):
-            trace_rays, box = _begin_frame("render", scene, shader, chosen)
+            traces = _begin_frame("render", scene, shader, chosen)
             first_frames = [each_tree.frame for each_tree in trees]
-        placed = camera.placed(box)
-        view = View(placed, placed.numbers(device), trace_rays, chosen, box)
+        view = View.of(camera, traces, chosen)
         hits = view.hits(progress)
         with stage("picture"):
             stats = tree_stats(trees, chosen, hits.samples, first_frames)
@@ -116,7 +115,7 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
     chosen = render_options("trace", options)
     check.instance("trace", "rays", rays, Rays)
     with using("trace", _trees("trace", tree)):
-        return _begin_frame("trace", tree, shader, chosen)[0](rays)
+        return trace_trees(_begin_frame("trace", tree, shader, chosen), rays)
 
 
 def _resident(context: str, scene: Any) -> Scene:
@@ -160,21 +159,16 @@ def using(context: str, trees: Sequence[N3Tree]) -> ExitStack:
 
 def _begin_frame(
     context: str, scene: Scene, shaders: Shaders, options: RenderOptions
-) -> tuple[TraceRays, Tensor]:
-    """Begins a frame, and returns its tracer and the scene's box."""
-    trees = _trees(context, scene)
-    for tree in trees:
+) -> list[TreeTrace]:
+    """Begins a frame of each tree, and returns their tracers."""
+    for tree in _trees(context, scene):
         tree.next_frame()
-    if not isinstance(scene, Mapping):
-        if isinstance(shaders, Mapping):
-            raise ValueError(f"{context}: shaders by name are for trees by name")
-        if isinstance(options.pose, Mapping):
-            raise ValueError(f"{context}: poses by name are for trees by name")
-        box = box_around(context, {"": scene}, options.pose)
-        return with_effects(Tracer(scene, shaders, options), options, box), box
-    box = box_around(context, scene, options.pose)
-    channels_by_tree = {name: (tree, tree.channel_names) for name, tree in scene.items()}
-    return partial(trace_trees, tree_traces(context, channels_by_tree, shaders, options, box)), box
+    if isinstance(scene, Mapping):
+        channels_by_tree = {name: (tree, tree.channel_names) for name, tree in scene.items()}
+        return tree_traces(context, channels_by_tree, shaders, options)
+    if isinstance(shaders, Mapping):
+        raise ValueError(f"{context}: shaders by name are for trees by name")
+    return [TreeTrace.of(Tracer(scene, shaders, options), options)]
 
 
 def tree_stats(
@@ -205,13 +199,27 @@ def tree_stats(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class View:
-    """A placed camera, the tracer of its rays, and the options of its picture."""
+    """A placed camera, the trees that its rays pass through, and the options of its picture."""
 
     camera: Camera
     numbers: Tensor  # of the camera, on the device that traces; graph replays overwrite them
-    trace_rays: TraceRays  # through all trees
+    trees: Sequence[TreeTrace]
     options: RenderOptions
-    box: Tensor  # (2, 3) world corners of the scene
+
+    @classmethod
+    def of(cls, camera: Camera, trees: Sequence[TreeTrace], options: RenderOptions) -> View:
+        """Places a camera around the trees, and sends its numbers to their device."""
+        placed = camera.placed(box_around([tree.box for tree in trees]))
+        return cls(placed, placed.numbers(trees[0].tracer.tree.device), trees, options)
+
+    @cached_property
+    def box(self) -> Tensor:
+        """(2, 3) world corners of the scene."""
+        return box_around([tree.box for tree in self.trees])
+
+    def trace(self, rays: Rays) -> Hits:
+        """Traces rays in world units through all trees."""
+        return trace_trees(self.trees, rays)
 
     @property
     def ray_count(self) -> int:
@@ -224,8 +232,9 @@ class View:
         Raises ValueError if the picture is larger than the device's memory.
         """
         device = self.numbers.device
+        alone = len(self.trees) == 1 and isinstance(self.trees[0].trace, Tracer)
         at_once = device.type == "cuda" or (
-            len(self.camera) > 1 and progress is no_progress and isinstance(self.trace_rays, Tracer)
+            alone and len(self.camera) > 1 and progress is no_progress
         )
         block = _RAYS_PER_BLOCK if at_once else _RAYS_PER_REPORT
         size = self.ray_count * (8 * self.options.dtype.itemsize + 5)  # the colour twice
@@ -263,11 +272,9 @@ class View:
             if len(rays.origin):
                 with stage("trace"):
                     if layer_pixels is None:
-                        hits = self.trace_rays(rays)
+                        hits = self.trace(rays)
                     else:
-                        hits = layer_pixels[traced].trace(
-                            self.trace_rays, rays, self.options.stop_alpha
-                        )
+                        hits = layer_pixels[traced].trace(self.trace, rays, self.options.stop_alpha)
                 yield traced, hits
             progress("rays", end, rows)
 

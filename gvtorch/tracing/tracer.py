@@ -23,7 +23,7 @@ from ..ops.trace import choose_backend
 from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Sampling, Shader, check_shader, interval_levels
-from .composite import tree_span
+from .composite import reaches_depth, tree_span
 from .options import RenderOptions
 from .pose import Pose
 
@@ -55,7 +55,9 @@ class Tracer:
         _check_step(tree, step, options)
         tree.warn_if_edited(learned=isinstance(shader, ModuleShader))
         self.tree, self.shader, self.channel = tree, shader, channel
-        self.pose = options.pose if isinstance(options.pose, Pose) else None
+        if options.pose is not None and not isinstance(options.pose, Pose):
+            raise ValueError("render: poses by name are for trees by name")
+        self.pose = options.pose
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
         scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
@@ -324,9 +326,8 @@ def march(
         clear = clear.index_put((open_index,), clear_after)
         with torch.no_grad():
             samples.index_add_(0, open_index[batch.ray], (clear_before > 0).to(torch.int32))
-            hit = (
-                (clear_before >= hit_clear) & (clear_before * (1 - alpha) < hit_clear)
-            ).nonzero()[:, 0]
+            passes = reaches_depth(clear_before, clear_before * (1 - alpha), arguments.depth_alpha)
+            hit = passes.nonzero()[:, 0]
             fraction = torch.log(hit_clear / clear_before[hit]) / torch.log1p(-alpha[hit])
             fraction = torch.where(alpha[hit] < 1, fraction.clamp(0, 1), 0.0)
             hit_depth = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pytest
@@ -100,9 +99,9 @@ class Frames:
             steady = self.engine.steady and not (ahead and ahead.due)
             if self.served.begin(stale, steady, stats):
                 self.served.serve()
-                for _ in range(self.served.extra_levels(self.engine.readbacks)):
+                for _ in range(self.engine.readbacks.extra_levels):
                     self.served.deepen()
-            self.engine.number_picture(on_device=False)
+            self.engine.number_picture()
             self.number = self.engine.frames
             numbers = self.camera.numbers(self.engine.device)
             if ahead is not None:
@@ -111,9 +110,7 @@ class Frames:
             hits = self.served.draw(self.view, ahead is not None)
             if ahead is not None and ahead.due:
                 self.served.look_ahead(ahead.hits)
-            collected = self.served.finish(hits)
-            if isinstance(self.served, HostFrame):
-                collected = collected._replace(ask=partial(self.served.ask, self.served.generation))
+            collected = self.served.to_read_back(self.served.finish(hits))
             self.engine.read_back(stats, hits, collected)
         self.engine.readbacks.hold_back()
         return hits, stats.settle()
