@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.constants import MAX_PICTURE_SIDE
 from ..base.records import Rays
 from ..pool.staging import upload
 from .models import MODELS, CameraColumns, CameraModel, PixelRows, last_rising_angle, model_of
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 _MIN_FOV_DEGREES = 1e-12
 _FIT_FRACTION = 0.98  # share of half the picture's width or height that a fitted box takes
-_MAX_PIXELS = 65536  # along a side
 
 
 class Camera:
@@ -90,8 +90,8 @@ class Camera:
         """
         model_of("Camera", model)
         self.model, self.frame = model, frame
-        self.width = check.integer("Camera", "width", width, low=1, high=_MAX_PIXELS)
-        self.height = check.integer("Camera", "height", height, low=1, high=_MAX_PIXELS)
+        self.width = check.integer("Camera", "width", width, low=1, high=MAX_PICTURE_SIDE)
+        self.height = check.integer("Camera", "height", height, low=1, high=MAX_PICTURE_SIDE)
         self.window = (0, self.height)
         view, K = batches("Camera", viewmats=(viewmats, (4, 4)), Ks=(Ks, (3, 3)))
         self.batched = view.dim() == 3
@@ -472,8 +472,8 @@ def _aimed(
         raise ValueError(
             f"{context}: fov must be at least {_MIN_FOV_DEGREES:g} degrees, got {fov!r}"
         )
-    check.integer(context, "width", width, low=1, high=_MAX_PIXELS)
-    check.integer(context, "height", height, low=1, high=_MAX_PIXELS)
+    check.integer(context, "width", width, low=1, high=MAX_PICTURE_SIDE)
+    check.integer(context, "height", height, low=1, high=MAX_PICTURE_SIDE)
     fx, fy = camera_model.focal(math.radians(fov), width, height)
     Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
     if camera_model.parallel:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
 from torch import Tensor
 
 from .reference.exact import sqrt_exact
-from .registry import Backend, Doubles, op
-
-_END = 2**31
+from .registry import Backend, Count, Doubles, op
 
 
 class PinholeColumns:
@@ -25,9 +21,6 @@ class PinholeColumns:
     RANGE = slice(18, 20)
 
 
-Count = Annotated[int, range(_END)]
-
-
 def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height: int) -> None:
     cameras, columns = camera_nc.shape
     if columns < (fewest := PinholeColumns.RANGE.stop):
@@ -36,7 +29,7 @@ def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height:
     if height < 1 or first + rows > cameras * height:
         available = f"{cameras} cameras of {height} rows"
         raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {available}")
-    if max(first + rows, rows * width) >= _END:
+    if max(first + rows, rows * width) >= 2**31:
         raise ValueError(f"pinhole_rays: {rows} rows of {width} are too many at once")
 
 
