@@ -149,7 +149,7 @@ def named_elsewhere(path: Path, name: str) -> bool:
     home = path.relative_to(PACKAGE).parts
     return (
         (home[0] == "ops" and name in vars(gvtorch.ops))
-        or (home == ("ops", "reference", "shaders.py") and name in vars(gvtorch.shaders))
+        or (home[:2] == ("ops", "reference") and name in vars(gvtorch.shaders))
         or (home[0] == "tools" and name.lower() == path.stem)
         or (home == ("viewer", "protocol.py") and name.lower() in MESSAGES)
         or (home[0] == "bench" and (name in WORKLOADS or "peers" in home))

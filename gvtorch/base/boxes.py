@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import check
+from .constants import MAX_EXTENT
 
 Zyx = Sequence[int]
 
@@ -64,6 +65,6 @@ def extent_in(
     if not isinstance(extent, int):
         return extent
     low, high = check.box(context, box)
-    check.integer(context, "extent", extent, low=1, high=2**40)
+    check.integer(context, "extent", extent, low=1, high=MAX_EXTENT)
     sides = [b - a for a, b in zip(low, high, strict=True)]
     return [max(1, round(extent * side / max(sides))) for side in sides]

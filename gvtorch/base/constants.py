@@ -17,6 +17,15 @@ DEPTH_ALPHA = 0.1
 #: Shortest interval, in voxels of the finest level.
 STEP = 0.5
 
+#: Largest branching: N of a tree, whose nodes split into N^3.
+MAX_BRANCHING = 16
+
+#: Most voxels along a side of a scene that a producer makes.
+MAX_EXTENT = 2**40
+
+#: Most pixels along a side of a picture.
+MAX_PICTURE_SIDE = 65536
+
 #: Most voxels that a volume in memory may have (2^31).
 MAX_VOXELS = 2**31
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,38 +17,27 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.constants import MAX_PICTURE_SIDE
 from ..base.records import Rays
-from ..base.volume import DIRECTIONS
 from ..pool.staging import upload
-from .models import MODELS, CameraModel, PixelRows, last_rising_angle, model_of
+from .models import MODELS, CameraColumns, CameraModel, PixelRows, last_rising_angle, model_of
+from .poses import (
+    Coordinates,
+    Numbers,
+    Up,
+    batches,
+    check_matrices,
+    continued,
+    look_at_pose,
+    orbit_pose,
+    upward,
+)
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-Numbers = float | Sequence[float] | Tensor
-Up = str | Sequence[float] | Tensor  # a name of `DIRECTIONS` such as "+z", or (3,) world
 _MIN_FOV_DEGREES = 1e-12
 _FIT_FRACTION = 0.98  # share of half the picture's width or height that a fitted box takes
-_MAX_TURN_RADIANS = 0.1  # from frame to frame; a camera that turns by more has jumped
-
-
-class Frame(Enum):
-    """What a camera's position is measured in."""
-
-    WORLD = "world"  # world units
-    BOX = "box"  # the scene's box: its centre is 0 and its largest side 1
-
-    @classmethod
-    def of(cls, context: str, value: Frame | str) -> Frame:
-        """Returns the frame of this name; raises ValueError where there is none."""
-        try:
-            return cls(value)
-        except ValueError:
-            raise ValueError(f"{context}: frame must be 'world' or 'box', got {value!r}") from None
-
-    def unit(self, box: Tensor) -> float:
-        """Returns its unit of length, world units, given the (2, 3) box of the scene."""
-        return 1.0 if self is Frame.WORLD else float((box[1] - box[0]).max())
 
 
 class CameraForm(NamedTuple):
@@ -87,7 +75,7 @@ class Camera:
 
     sample = 0
     fitted: tuple[float, float] | None = None
-    cone_columns = slice(16, 18)  # of `numbers`
+    columns: Any = CameraColumns  # of `numbers`
 
     def __init__(
         self,
@@ -99,7 +87,7 @@ class Camera:
         model: CameraModel = "pinhole",
         radial_coeffs: Numbers | None = None,
         max_angle: float = 180.0,
-        frame: Frame = Frame.WORLD,
+        frame: Coordinates = Coordinates.WORLD,
     ) -> None:
         """Takes matrices (4, 4) and (3, 3), or batches (n, 4, 4) and (n, 3, 3); see the class.
 
@@ -117,13 +105,13 @@ class Camera:
         """
         model_of("Camera", model)
         self.model, self.frame = model, frame
-        self.width = check.integer("Camera", "width", width, low=1, high=65536)
-        self.height = check.integer("Camera", "height", height, low=1, high=65536)
+        self.width = check.integer("Camera", "width", width, low=1, high=MAX_PICTURE_SIDE)
+        self.height = check.integer("Camera", "height", height, low=1, high=MAX_PICTURE_SIDE)
         self.window = (0, self.height)
-        view, K = _batch("Camera", viewmats=(viewmats, (4, 4)), Ks=(Ks, (3, 3)))
+        view, K = batches("Camera", viewmats=(viewmats, (4, 4)), Ks=(Ks, (3, 3)))
         self.batched = view.dim() == 3
         self.viewmats, self.Ks = view.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
-        _check_matrices(self.viewmats, self.Ks)
+        check_matrices(self.viewmats, self.Ks)
         angle = check.number("Camera", "max_angle", max_angle, low=0, high=180, open_low=True)
         self.max_angle = torch.full((len(self),), math.radians(angle), dtype=torch.float64)
         self.radial_coeffs = torch.zeros(len(self), 4, dtype=torch.float64)
@@ -179,21 +167,14 @@ class Camera:
         if fit and distance is not None:
             raise ValueError(f"{context}: fit finds the distance: leave it out, got {distance!r}")
         distance = (1.0 if fit else 2.4) if distance is None else distance
-        az, el, distances = _batch(
+        az, el, distances = batches(
             context, azimuth=(azimuth, ()), elevation=(elevation, ()), distance=(distance, ())
         )
         if bool((distances <= 0).any()):
             raise ValueError(f"{context}: distance must be > 0, got {distance!r}")
-        az, el = az.deg2rad(), el.deg2rad()
-        zero = torch.zeros_like(az)
-        outward = torch.stack((az.sin() * el.cos(), el.sin(), az.cos() * el.cos()), -1)
-        sign = torch.where(el.cos() < -1e-12, -1.0, 1.0)  # keeps up upward beyond a pole
-        right = torch.stack((sign * az.cos(), zero, -sign * az.sin()), -1)
-        if not (isinstance(up, str) and up == "+y"):  # +y needs no rotation
-            axes = _axes_around(upward(context, up))
-            outward, right = outward @ axes, right @ axes
-        view = _viewmat(outward * distances[..., None], -outward, right)
-        camera = _aimed(context, view, distances, fov, width, height, model, Frame.BOX)
+        axis = None if isinstance(up, str) and up == "+y" else upward(context, up)
+        view = orbit_pose(az.deg2rad(), el.deg2rad(), distances, axis)
+        camera = _aimed(context, view, distances, fov, width, height, model, Coordinates.BOX)
         if fit:
             focal = camera.Ks[0, (0, 1), (0, 1)].tolist()
             camera.fitted = (0.5 * width / focal[0], 0.5 * height / focal[1])
@@ -252,22 +233,15 @@ class Camera:
         """
         context = "Camera.look_at"
         up = upward(context, up) if isinstance(up, str) else up
-        eye_, target_, up_ = _batch(context, eye=(eye, (3,)), target=(target, (3,)), up=(up, (3,)))
+        eye_, target_, up_ = batches(context, eye=(eye, (3,)), target=(target, (3,)), up=(up, (3,)))
         if bool((up_ == 0).all(-1).any()):
             raise ValueError(f"{context}: up must not be zero")
         forward = target_ - eye_
         length = forward.norm(dim=-1, keepdim=True)
         if bool((length == 0).any()):
             raise ValueError(f"{context}: eye and target are at the same position, {eye!r}")
-        forward = forward / length
-        right = torch.linalg.cross(forward, up_)
-        along_z = forward[..., 2:3].abs() > 0.9
-        fallback = torch.where(along_z, *forward.new_tensor([[0, 1, 0], [0, 0, -1]]))
-        parallel = right.norm(dim=-1, keepdim=True) < 1e-9 * up_.norm(dim=-1, keepdim=True) + 1e-300
-        right = torch.where(parallel, torch.linalg.cross(forward, fallback), right)
-        right = right / right.norm(dim=-1, keepdim=True)
-        view = _viewmat(eye_, forward, right)
-        return _aimed(context, view, length[..., 0], fov, width, height, model, Frame.WORLD)
+        view = look_at_pose(eye_, forward / length, up_)
+        return _aimed(context, view, length[..., 0], fov, width, height, model, Coordinates.WORLD)
 
     @classmethod
     def from_viewmat_K(
@@ -352,7 +326,7 @@ class Camera:
 
     def placed(self, box: Tensor) -> Camera:
         """Returns the camera in world units, given the (2, 3) box of the scene."""
-        if self.frame is Frame.WORLD:
+        if self.frame is Coordinates.WORLD:
             return self
         # NumPy, here and in `numbers`: calls of torch take longer, and release the GIL, for which
         # the frame would queue again and again behind the threads that read a store.
@@ -376,7 +350,7 @@ class Camera:
             Ks = Ks.clone()
             Ks[:, (0, 1), (0, 1)] /= scale
         changes = {"viewmats": torch.from_numpy(view), "Ks": Ks}
-        return self._copy_with(**changes, frame=Frame.WORLD, fitted=None)
+        return self._copy_with(**changes, frame=Coordinates.WORLD, fitted=None)
 
     def pixel_width(self, distance: float) -> float:
         """Returns the width of a pixel in world units: of a pinhole at a distance along its axis,
@@ -385,8 +359,8 @@ class Camera:
         Raises:
             ValueError: It is a fisheye or a panorama, a batch, or relative to a box.
         """
-        context = "Camera.pixel_width"
-        if self.model not in ("pinhole", "ortho") or len(self) != 1 or self.frame is Frame.BOX:
+        context, in_world = "Camera.pixel_width", self.frame is Coordinates.WORLD
+        if self.model not in ("pinhole", "ortho") or len(self) != 1 or not in_world:
             raise ValueError(
                 f"{context}: takes one pinhole or ortho camera in the world, got {self}"
             )
@@ -407,15 +381,13 @@ class Camera:
         return self.shifted(0, first)._copy_with(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns the numbers that `pixel_rays` reads; does not wait for the device. (n, 26)
-        float64: rotation to the camera (9), position (3), focal lengths and principal point (2, 2;
-        pixel centres at integers), cone (2), range (2), a fisheye's coefficients (4) and largest
-        angle (1), and the sample (1).
+        """Returns what `pixel_rays` reads, (n, 26) float64, see `CameraColumns`; does not wait for
+        the device.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
         """
-        if self.frame is not Frame.WORLD:
+        if self.frame is not Coordinates.WORLD:
             raise ValueError(
                 "Camera.rays: an orbit camera has no position yet, call placed(tree.box)"
             )
@@ -424,7 +396,7 @@ class Camera:
         focal, centre = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2] - 0.5
         position = -_sum_of_three(rotation.swapaxes(0, 1), translation.T[..., None])  # -R^T t
         pixel, zero = 1 / focal.min(1, keepdims=True), np.zeros((len(self), 1))
-        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)  # `cone_columns`
+        cone = (pixel, zero) if MODELS[self.model].parallel else (zero, pixel)
         range_ = (zero, zero + math.inf)
         lens = (self.radial_coeffs.numpy(), self.max_angle.numpy()[:, None])
         parts = (rotation.reshape(-1, 9), position, focal, centre, *cone, *range_, *lens)
@@ -441,10 +413,11 @@ class Camera:
         from the `numbers` of the last two frames; see `continued`. Each ray passes through the
         middle of its pixels, and its cone is as wide as one of them.
         """
-        moved = continued(now, before, frames, moving=12, axes=slice(0, 9))
-        focal, centre = moved[:, 12:14], moved[:, 14:16]
-        middle = (centre - (stride - 1) / 2) / stride
-        return torch.cat((moved[:, :12], focal / stride, middle, moved[:, 16:]), 1)
+        at = CameraColumns
+        moved = continued(now, before, frames, at.POSE, at.ROTATION)
+        moved[:, at.FOCAL] /= stride
+        moved[:, at.CENTRE] = (moved[:, at.CENTRE] - (stride - 1) / 2) / stride
+        return moved
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays through the pixel centres of whole rows, from the result of `numbers`.
@@ -457,7 +430,8 @@ class Camera:
         """Returns `Rays.sample` of whole rows, counted as for `pixel_rays`."""
         row = torch.arange(*rows, device=numbers.device)
         column = torch.arange(self.width, device=numbers.device)
-        pictures = numbers[:, -1].view(len(self), -1)[:, 0]  # custom: a row per ray, all alike
+        samples = numbers[:, self.columns.SAMPLE]
+        pictures = samples.reshape(len(self), -1)[:, 0]  # custom: a row per ray, all alike
         sample = pictures[row // self.height].to(torch.int64) << 32
         first = (self.window[0] + row % self.height) * self.width
         return ((sample + first)[:, None] + column).flatten()
@@ -490,98 +464,9 @@ _BATCHED_FIELDS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # one row pe
 _CORNERS = list(itertools.product((0, 1), repeat=3))
 
 
-def continued(now: Tensor, before: Tensor, frames: float, moving: int, axes: slice) -> Tensor:
-    """Extrapolates the numbers (n, c) float64 of cameras, or of rays, by `frames` frames, given
-    those of now and of one frame before; does not wait for the device. The first `moving` columns
-    change; `axes` among these hold unit vectors, three columns each: where one of them turned by
-    more than 0.1 radian, that row stays as it is now.
-    """
-    motion = (now - before)[:, :moving]
-    turn_squared = motion[:, axes].unflatten(1, (-1, 3)).square().sum(2).amax(1, keepdim=True)
-    displacement = torch.where(
-        turn_squared <= _MAX_TURN_RADIANS * _MAX_TURN_RADIANS, frames * motion, 0.0
-    )
-    return torch.cat((now[:, :moving] + displacement, now[:, moving:]), 1)
-
-
 def _sum_of_three(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Sums values (3, ...) times weights (3, ...) over the three, in order."""
     return values[0] * weights[0] + values[1] * weights[1] + values[2] * weights[2]
-
-
-def upward(context: str, up: Up) -> Tensor:
-    """Returns the up direction, (3,) float64, from a name such as "+z" or three numbers; raises
-    ValueError where it is neither, or zero.
-    """
-    if isinstance(up, str):
-        if up not in DIRECTIONS:
-            names = ", ".join(DIRECTIONS)
-            raise ValueError(f"{context}: up must be one of {names} or three numbers, got {up!r}")
-        axis, sign = divmod(DIRECTIONS.index(up), 2)
-        return torch.eye(3, dtype=torch.float64)[axis] * (1 - 2 * sign)
-    direction = torch.tensor(check.triple(context, "up", up), dtype=torch.float64)
-    if not bool(direction.any()):
-        raise ValueError(f"{context}: up must not be zero")
-    return direction
-
-
-def _axes_around(up: Tensor) -> Tensor:
-    """Returns (3, 3), the directions of an orbit's x, y and z axes for another `up`."""
-    up = up / up.norm()
-    right = torch.zeros_like(up)
-    right[int(up[0].abs() > 0.9)] = 1
-    right = right - (right @ up) * up
-    right = right / right.norm()
-    return torch.stack((right, up, torch.linalg.cross(right, up)))
-
-
-def _batch(context: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]:
-    """Returns numbers of one camera (*shape), or of n cameras (n, *shape), broadcast."""
-    parsed, sizes = [], []
-    for name, (value, shape) in values.items():
-        numbers = check.reals(context, name, value)
-        batch = numbers.dim() - len(shape)
-        if batch not in (0, 1) or numbers.shape[batch:] != shape:
-            batch_shape = str(("n", *shape)).replace("'", "")
-            got = tuple(numbers.shape)
-            raise ValueError(
-                f"{context}: {name} must be {shape or 'a number'} or {batch_shape}, got {got}"
-            )
-        parsed.append((numbers, shape))
-        sizes.append(numbers.shape[:batch])
-    try:
-        size = np.broadcast_shapes(*sizes)  # torch's imports sympy: half a second
-    except ValueError:
-        raise ValueError(
-            f"{context}: {', '.join(values)} do not match, they have different lengths"
-        ) from None
-    return [numbers.expand((*size, *shape)).contiguous() for numbers, shape in parsed]
-
-
-def _check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
-    """Raises ValueError unless these are poses (n, 4, 4) and intrinsics (n, 3, 3)."""
-    rotation, bottom = viewmats[:, :3, :3], viewmats.new_tensor([0, 0, 0, 1])
-    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
-    rotates = error <= 1e-3 and (torch.linalg.det(rotation) >= 0).all()
-    last = (viewmats[:, 3] == bottom).all() and (Ks[:, 2] == bottom[1:]).all()
-    for wanted, holds in {
-        "Ks must have positive focal lengths": (Ks[:, (0, 1), (0, 1)] > 0).all(),
-        "viewmats must hold rotations (orthonormal, determinant +1)": rotates,
-        "last rows must be (0, 0, 0, 1) of viewmats, (0, 0, 1) of Ks": last,
-        "Ks must have no skew": (Ks[:, (0, 1), (1, 0)] == 0).all(),
-    }.items():
-        if not holds:
-            raise ValueError(f"Camera: {wanted}")
-
-
-def _viewmat(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
-    """World-to-camera matrix (..., 4, 4) from a position and two orthonormal directions."""
-    down = torch.linalg.cross(forward, right)
-    rotation = torch.stack((right, down, forward), dim=-2)
-    view = torch.eye(4, dtype=torch.float64).repeat(*eye.shape[:-1], 1, 1)
-    view[..., :3, :3] = rotation
-    view[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
-    return view
 
 
 def _aimed(
@@ -592,7 +477,7 @@ def _aimed(
     width: int,
     height: int,
     model: CameraModel,
-    frame: Frame,
+    frame: Coordinates,
 ) -> Camera:
     """Returns cameras with a centred axis; `distance` (...) is that of the target."""
     camera_model = model_of(context, model)
@@ -602,8 +487,8 @@ def _aimed(
         raise ValueError(
             f"{context}: fov must be at least {_MIN_FOV_DEGREES:g} degrees, got {fov!r}"
         )
-    check.integer(context, "width", width, low=1, high=65536)
-    check.integer(context, "height", height, low=1, high=65536)
+    check.integer(context, "width", width, low=1, high=MAX_PICTURE_SIDE)
+    check.integer(context, "height", height, low=1, high=MAX_PICTURE_SIDE)
     fx, fy = camera_model.focal(math.radians(fov), width, height)
     Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
     if camera_model.parallel:

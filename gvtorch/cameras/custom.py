@@ -11,7 +11,19 @@ from torch.nn.functional import normalize
 from ..base.check import describe, instance, integer
 from ..base.records import Rays
 from ..pool.staging import upload
-from .camera import Camera, Frame, continued
+from .camera import Camera
+from .poses import Coordinates, continued
+
+
+class RayColumns:
+    """Columns of `CustomCamera.numbers`, of which a row is a ray: the fields of `Rays`."""
+
+    LINE = slice(0, 6)  # the next two
+    ORIGIN = slice(0, 3)
+    DIRECTION = slice(3, 6)
+    CONE = slice(6, 8)
+    RANGE = slice(8, 10)
+    SAMPLE = slice(10, 11)
 
 
 class CustomCamera(Camera):
@@ -19,7 +31,7 @@ class CustomCamera(Camera):
 
     model: Any = "custom"
     distorted = False
-    cone_columns = slice(6, 8)
+    columns = RayColumns
 
     def __init__(self, rays: Rays, width: int | None = None, height: int | None = None) -> None:
         """Takes rays row by row, picture by picture.
@@ -62,7 +74,7 @@ class CustomCamera(Camera):
                 f"{self.width}x{self.height} pixels"
             )
         columns.append(torch.zeros_like(columns[0][:, :1]))
-        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)  # (r, 11)
+        self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)
         if rays.direction.device.type == "cpu":
             has_nan = self._rays.isnan().any(1)
             if bool(has_nan.any()):
@@ -73,7 +85,7 @@ class CustomCamera(Camera):
                     "CustomCamera: directions must be of unit length, "
                     f"{int(off_unit.sum())} are not"
                 )
-        self.frame, self.batched = Frame.WORLD, count > self.width * self.height
+        self.frame, self.batched = Coordinates.WORLD, count > self.width * self.height
 
     @classmethod
     def from_directions(
@@ -127,12 +139,14 @@ class CustomCamera(Camera):
         """Number of pictures."""
         return len(self._rays) // (self.width * self.height)
 
-    def _pictures(self) -> Tensor:
-        return self._rays.view(-1, self.height, self.width, 11)
+    def _pictures(self, rays: Tensor | None = None) -> Tensor:
+        """Returns its rays (n, h, w, c), or other `rays` (r, c) of pictures of this size."""
+        rays = self._rays if rays is None else rays
+        return rays.view(-1, self.height, self.width, rays.shape[1])
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
-        return self._copy_with(_rays=self._pictures()[index].reshape(-1, 11), batched=False)
+        return self._copy_with(_rays=self._pictures()[index].flatten(0, 1), batched=False)
 
     def same(self, other: Camera) -> bool:
         """Whether the other has the same tensor of rays."""
@@ -144,23 +158,23 @@ class CustomCamera(Camera):
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
         """Returns the camera with its rays moved by dx and dy times the step to a neighbour."""
-        lines = self._pictures()[..., :6]
+        lines, rays = self._pictures()[..., RayColumns.LINE], self._rays.clone()
         moved = lines + dx * _ray_step(lines, -2) + dy * _ray_step(lines, -3)
-        origin, direction = moved.split(3, -1)
-        direction = direction / direction.norm(dim=-1, keepdim=True)
-        rays = torch.cat((origin, direction, self._pictures()[..., 6:]), -1).reshape(-1, 11)
+        origin, direction = moved.flatten(0, 2).split(3, 1)
+        rays[:, RayColumns.ORIGIN] = origin
+        rays[:, RayColumns.DIRECTION] = direction / direction.norm(dim=1, keepdim=True)
         if sample is not None:
-            rays[:, -1] = sample
+            rays[:, RayColumns.SAMPLE] = sample
         return self._copy_with(_rays=rays)
 
     def strip(self, first: int, end: int) -> Camera:
         """Returns the camera of the rows [first, end) of each picture."""
-        rays = self._pictures()[:, first:end].reshape(-1, 11)
+        rays = self._pictures()[:, first:end].flatten(0, 2)
         window = (self.window[0] + first, self.window[1])
         return self._copy_with(_rays=rays, height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns (r, 11) float64: origin, direction, cone, range and sample."""
+        """Returns (r, 11) float64, see `RayColumns`."""
         return upload(self._rays, torch.device(device))
 
     def thinned(self, stride: int) -> Camera:
@@ -168,24 +182,29 @@ class CustomCamera(Camera):
         rays = self._pictures()[:, ::stride, ::stride]
         height, width = rays.shape[1:3]
         changes = {"height": height, "width": width, "window": (0, height)}
-        return self._copy_with(_rays=rays.reshape(-1, 11), **changes)
+        return self._copy_with(_rays=rays.flatten(0, 2), **changes)
 
     def numbers_ahead(self, now: Tensor, before: Tensor, frames: float, stride: int) -> Tensor:
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
         from the `numbers` of the last two frames; see `continued`.
         """
 
-        def thin(numbers: Tensor) -> Tensor:
-            pictures = numbers.view(-1, self.height, self.width, 11)
-            return pictures[:, ::stride, ::stride].reshape(-1, 11)
-
-        return continued(thin(now), thin(before), frames, moving=6, axes=slice(3, 6))
+        now, before = (
+            self._pictures(numbers)[:, ::stride, ::stride].flatten(0, 2)
+            for numbers in (now, before)
+        )
+        return continued(now, before, frames, RayColumns.LINE, RayColumns.DIRECTION)
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:
         """Returns the rays of whole rows, from the result of `numbers`."""
         part = numbers[rows[0] * self.width : rows[1] * self.width]
-        origin, direction, cone, limits, _ = part.split((3, 3, 2, 2, 1), 1)
-        return Rays(origin=origin, direction=direction, cone=cone, range=limits, width=self.width)
+        return Rays(
+            origin=part[:, RayColumns.ORIGIN],
+            direction=part[:, RayColumns.DIRECTION],
+            cone=part[:, RayColumns.CONE],
+            range=part[:, RayColumns.RANGE],
+            width=self.width,
+        )
 
 
 def as_camera(context: str, camera: Camera | Rays) -> Camera:

@@ -28,8 +28,9 @@ from torch import Tensor
 from ..base import check
 from ..base.messages import one_line
 from ..base.whole_file import write_text
-from .camera import Camera, Frame
+from .camera import Camera
 from .motion import quaternion_of, rotation_of
+from .poses import Coordinates
 
 _FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))  # y down to y up
 _PVCC_PROPERTIES = (
@@ -121,7 +122,7 @@ def write_cameras(
         cameras = {f"{n:04d}.png": cameras[n] for n in range(len(cameras))}
     for name, camera in cameras.items():
         check.instance(context, "cameras", camera, Camera)
-        if camera.frame is Frame.BOX or len(camera) != 1:
+        if camera.frame is Coordinates.BOX or len(camera) != 1:
             raise ValueError(f"{context}: {name!r} must be one camera in the world, got {camera}")
         if not name or any(letter.isspace() for letter in name):
             raise ValueError(f"{context}: names must not contain blanks, got {name!r}")

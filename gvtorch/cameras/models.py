@@ -16,6 +16,7 @@ from torch import Tensor
 from ..base import check
 from ..base.records import Rays
 from ..ops import pinhole_rays
+from ..ops.cameras import PinholeColumns
 
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
 _NEWTON_STEPS = 20  # one that leaves the bracket halves it instead
@@ -25,11 +26,19 @@ _MAX_HALF_ANGLE = math.radians(45)  # largest half angle that a fitted box spans
 _ORTHO_CLEARANCE = 1.02
 
 
+class CameraColumns(PinholeColumns):
+    """Columns of `Camera.numbers`: a pinhole's, and those that the op does not read."""
+
+    COEFFICIENTS = slice(20, 24)  # of a fisheye
+    MAX_ANGLE = slice(24, 25)  # of a fisheye's rays to the axis, radians
+    SAMPLE = slice(25, 26)  # see `Rays.sample`
+
+
 @dataclass(frozen=True)
 class PixelRows:
     """Rows of pixels on the image planes of cameras: y rows of w pixels, r = y * w in all."""
 
-    cameras: Tensor  # (n, 26) float64, see `Camera.numbers`
+    cameras: Tensor  # (n, 26) float64, see `CameraColumns`
     rows: tuple[int, int]  # the first one and the one after the last, counted through the batch
     width: int
     height: int  # of one picture
@@ -49,22 +58,32 @@ class PixelRows:
     def x(self) -> Tensor:
         """(k, w) float64."""
         column = torch.arange(self.width, dtype=torch.float64, device=self.cameras.device)
-        return (column - self.numbers[:, 14, None]) / self.numbers[:, 12, None]
+        return (column - self.centre[:, :1]) / self.focal[:, :1]
 
     @cached_property
     def y(self) -> Tensor:
         """(y,) float64."""
-        return (self.row % self.height - self.numbers[:, 15]) / self.numbers[:, 13]
+        return (self.row % self.height - self.centre[:, 1]) / self.focal[:, 1]
+
+    @property
+    def focal(self) -> Tensor:
+        """(k, 2) focal lengths fx and fy, pixels."""
+        return self.numbers[:, CameraColumns.FOCAL]
+
+    @property
+    def centre(self) -> Tensor:
+        """(k, 2) principal point, pixels."""
+        return self.numbers[:, CameraColumns.CENTRE]
 
     @property
     def rotation(self) -> Tensor:
         """(k, 3, 3) world to camera."""
-        return self.numbers[:, :9].unflatten(1, (3, 3))
+        return self.numbers[:, CameraColumns.ROTATION].unflatten(1, (3, 3))
 
     @property
     def position(self) -> Tensor:
         """(k, 3) world."""
-        return self.numbers[:, 9:12]
+        return self.numbers[:, CameraColumns.POSITION]
 
     def spread(self, values: Tensor) -> Tensor:
         """Repeats (k, c) for all rays, (r, c); values of a single camera are not copied."""
@@ -90,7 +109,8 @@ class PixelRows:
         `origin` (y, w, 3), by default the camera's position; `widening` (y, w) is a factor on the
         cones, and pixels that are not `inside` (y, w) get an empty range.
         """
-        cone, limits = (self.spread(part) for part in self.numbers[:, 16:20].split(2, 1))
+        cone = self.spread(self.numbers[:, CameraColumns.CONE])
+        limits = self.spread(self.numbers[:, CameraColumns.RANGE])
         if widening is not None:
             cone = cone * widening.reshape(-1, 1)
         if inside is not None:
@@ -191,7 +211,8 @@ class Fisheye(Model):
 
     def rays(self, pixels: PixelRows) -> Rays:
         x, y = pixels.x, pixels.y[:, None]
-        k, limit = pixels.numbers[:, 20:24], pixels.numbers[:, 24:25]
+        k = pixels.numbers[:, CameraColumns.COEFFICIENTS]
+        limit = pixels.numbers[:, CameraColumns.MAX_ANGLE]
         radius = (x * x + (y * y)).sqrt()  # (y, w)
         angle = undistort(radius, k, limit) if pixels.distorted else radius
         scale = torch.where(radius > 0, angle.sin() / radius, 1.0)
@@ -228,7 +249,7 @@ class Panorama(Model):
         below_poles = latitude.abs() <= _EDGE_TOLERANCE * math.pi / 2
         inside = below_poles & (longitude.abs() <= _EDGE_TOLERANCE * math.pi)
         # A pixel spans 1 / fy radians down, and along its circle of latitude cos / fx.
-        fx, fy = pixels.numbers[:, 12:14].unbind(1)
+        fx, fy = pixels.focal.unbind(1)
         span = torch.maximum(pixels.y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
         widening = span[:, None].expand_as(latitude)
         return pixels.rays(

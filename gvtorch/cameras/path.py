@@ -15,8 +15,9 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
-from .camera import Camera, Up, upward
+from .camera import Camera
 from .models import CameraModel, model_of
+from .poses import Up, upward
 
 _DEFAULT_UP, _DEFAULT_FOV = (0.0, 1.0, 0.0), 30.0  # of keys that have none
 

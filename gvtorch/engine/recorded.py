@@ -109,7 +109,7 @@ class RecordedFrame(ABC):
         """Traces the picture, and lists its requests. `looks_ahead`: `look_ahead` may follow."""
         self.cache.frame_1.add_(1)
         if self._fit:
-            view.numbers[:, view.camera.cone_columns].mul_(self._cone_factor)
+            view.numbers[:, view.camera.columns.CONE].mul_(self._cone_factor)
         hits = view.hits()
         self._listed, self._looks_ahead = self._list_requests(0), looks_ahead
         if looks_ahead:

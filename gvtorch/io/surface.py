@@ -24,6 +24,7 @@ from ..base.volume import Volume, to_numpy
 from ..meshes.contour import contour, edge_of
 from ..meshes.mesh import Mesh
 from ..pool import N3Tree
+from ..pool.refresh import Span
 from .stores.store import CELL, Store
 from .surface_file import SurfaceFile, check_surface_path
 
@@ -192,7 +193,7 @@ class _Grid:
         if isinstance(self.source, Store):
             return self.source.read_region(self.level, low, high)
         if isinstance(self.source, N3Tree):
-            voxels = self._bricks.read(self._channel, self.level, tuple(low), tuple(high))
+            voxels = self._bricks.read(self._channel, self.level, Span(tuple(low), tuple(high)))
         else:
             voxels = self.source.data[tuple(map(slice, low, high))]
         return to_numpy(voxels)

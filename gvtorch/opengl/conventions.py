@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..cameras.camera import Camera, Frame
+from ..cameras.camera import Camera
+from ..cameras.poses import Coordinates
 from ..pool.staging import upload
 
 _AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # flips y and z
@@ -58,7 +59,7 @@ def matrices(
         ValueError: The camera is an orbit camera without a position, or not 0 < near < far.
     """
     context = "opengl.matrices"
-    if camera.frame is not Frame.WORLD:
+    if camera.frame is not Coordinates.WORLD:
         raise ValueError(f"{context}: an orbit camera has no position yet, call placed(tree.box)")
     check.number(context, "near", near, low=0, open_low=True)
     if far != math.inf:

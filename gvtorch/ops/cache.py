@@ -29,7 +29,6 @@ from ..base.constants import (
 from ..base.volume import movable
 from .registry import Backend, Bytes, Flags, Longs, Requests, Words, choose_backend, op
 
-Count = Annotated[int, range(2**31)]
 Positive = Annotated[int, range(1, 2**31)]
 Branching = Annotated[int, range(2, 2**15)]  # N of a tree
 

@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
 from torch import Tensor
 
 from .reference.exact import sqrt_exact
-from .registry import Backend, Doubles, op
+from .registry import Backend, Count, Doubles, op
 
-_END = 2**31
-Count = Annotated[int, range(_END)]
+
+class PinholeColumns:
+    """Columns of `camera_nc`: the numbers of a camera that `pinhole_rays` reads."""
+
+    POSE = slice(0, 12)  # the next two
+    ROTATION = slice(0, 9)  # (3, 3), world to camera
+    POSITION = slice(9, 12)  # world
+    FOCAL = slice(12, 14)  # x, y; pixels
+    CENTRE = slice(14, 16)  # principal point x, y; pixels, whose centres are at integers
+    CONE = slice(16, 18)  # as in `Rays`
+    RANGE = slice(18, 20)
 
 
 def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height: int) -> None:
     cameras, columns = camera_nc.shape
-    if columns < 20:
-        raise ValueError(f"pinhole_rays: camera_nc must have 20 columns or more, got {columns}")
+    if columns < (fewest := PinholeColumns.RANGE.stop):
+        wanted = f"{fewest} columns or more"
+        raise ValueError(f"pinhole_rays: camera_nc must have {wanted}, got {columns}")
     if height < 1 or first + rows > cameras * height:
         available = f"{cameras} cameras of {height} rows"
         raise ValueError(f"pinhole_rays: no rows {first} to {first + rows} in {available}")
-    if max(first + rows, rows * width) >= _END:
+    if max(first + rows, rows * width) >= 2**31:
         raise ValueError(f"pinhole_rays: {rows} rows of {width} are too many at once")
 
 
 @op(_check_rows)
 def pinhole_rays(
-    camera_nc: Doubles,  # from column 0: rotation (3, 3), world to camera; 9: position; 12: focal
-    # lengths; 14: principal point, pixel centres at integers; 16: cone; 18: range
+    camera_nc: Doubles,  # see `PinholeColumns`
     first: Count,  # row, counted through the batch
     rows: Count,
     width: Count,  # pixels of a row
@@ -45,15 +52,17 @@ def pinhole_rays(
     row = torch.arange(first, first + rows, device=camera_nc.device)
     column = torch.arange(width, dtype=torch.float64, device=camera_nc.device)
     camera = camera_nc[row // height]  # of each row
-    fx, fy, cx, cy = (number[:, None] for number in camera[:, 12:16].unbind(1))
+    at = PinholeColumns
+    fx, fy = camera[:, at.FOCAL].split(1, 1)
+    cx, cy = camera[:, at.CENTRE].split(1, 1)
     x, y = (column - cx) / fx, ((row % height)[:, None] - cy) / fy
-    rotation = camera[:, :9].unflatten(1, (3, 3))
+    rotation = camera[:, at.ROTATION].unflatten(1, (3, 3))
     length = sqrt_exact(x * x + (y * y + 1))
     across, down = x[..., None] * rotation[:, None, 0], y * rotation[:, 1] + rotation[:, 2]
     direction = (across + down[:, None]) / length[..., None]
 
-    def per_pixel(first_column: int, count: int) -> Tensor:
-        numbers = camera[:, None, first_column : first_column + count]
-        return numbers.expand(rows, width, count).reshape(-1, count)
+    def per_pixel(columns: slice) -> Tensor:
+        return camera[:, None, columns].expand(-1, width, -1).flatten(0, 1)
 
-    return per_pixel(9, 3), direction.view(-1, 3), per_pixel(16, 2), per_pixel(18, 2)
+    origin, cone, limits = (per_pixel(columns) for columns in (at.POSITION, at.CONE, at.RANGE))
+    return origin, direction.view(-1, 3), cone, limits

@@ -23,6 +23,7 @@ Requests = Annotated[Tensor, torch.int16]
 Flags = Annotated[Tensor, torch.bool]
 Bytes = Annotated[Tensor, torch.uint8]
 Doubles = Annotated[Tensor, torch.float64]
+Count = Annotated[int, range(2**31)]  # what an int32 can count
 _DTYPES = (torch.int32, torch.int64, torch.int16, torch.bool, torch.uint8, torch.float64)
 _Twin = TypeVar("_Twin", bound=Callable[..., Any])
 

@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,27 +15,51 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.volume import DIRECTIONS
 
 Number = float | Tensor
 Triple = Sequence[float] | Tensor
 
+#: Numbers of a colour in a voxel: red, green, blue, opacity.
+COLOR_WIDTH = 4
+#: Numbers of a filtered colour of lit matter: red, green, blue, alpha, then the mean products
+#: xx xy xz yy yz zz of the components of its normals. All but alpha are premultiplied.
+LIT_COLOR_WIDTH = 10
 
-#: The kinds of the fused shaders, in the order of `GV_SHADERS` in csrc/shaders/shaders.h.
-SHADER_KINDS = (
-    "Lit",
-    "PreIntegrated",
-    "StoredColor",
-    "Isosurface",
-    "Projection",
-    "Features",
-    "ShadowedLit",
-    "ShadowedColor",
-    "GradientMagnitude",
-    "Filtered",
-    "ChannelMix",
-    "Labels",
-    "FilteredLit",
-)
+
+def channel_widths(color_width: int) -> tuple[int, int]:
+    """Returns how many numbers a voxel has that holds one colour, or one for each direction."""
+    return color_width, len(DIRECTIONS) * color_width
+
+
+@dataclass(frozen=True)
+class ShaderFacts:
+    """What a fused shader requires of the arguments of `shade_rays`."""
+
+    integrates: bool = False  # its table is (l, m, m, 4)
+    colored: bool = False  # its channel holds colours: see `channel_widths`
+    filtered: int = 0  # above 0: width of the colours in its second channel, of which only the
+    # pool's first bricks have them
+    features: int | None = 0  # how many it returns; None: as many as its second channel is wide
+    shadows: bool = False  # each sample sends a ray to the light
+
+
+#: The fused shaders, in the order of `GV_SHADERS` in csrc/shaders/shaders.h.
+SHADER_KINDS: Mapping[str, ShaderFacts] = {
+    "Lit": ShaderFacts(),
+    "PreIntegrated": ShaderFacts(integrates=True),
+    "StoredColor": ShaderFacts(colored=True),
+    "Isosurface": ShaderFacts(),
+    "Projection": ShaderFacts(features=1),
+    "Features": ShaderFacts(features=None),
+    "ShadowedLit": ShaderFacts(shadows=True),
+    "ShadowedColor": ShaderFacts(colored=True, shadows=True),
+    "GradientMagnitude": ShaderFacts(),
+    "Filtered": ShaderFacts(filtered=COLOR_WIDTH),
+    "ChannelMix": ShaderFacts(),
+    "Labels": ShaderFacts(features=1),
+    "FilteredLit": ShaderFacts(filtered=LIT_COLOR_WIDTH),
+}
 
 
 #: Filtered colours hold the moments of normals that no light reaches divided by this, and shaders
@@ -45,7 +70,7 @@ FAINT = 32
 def shader_number(kind: str) -> int:
     """Returns the number of a fused shader; raises ValueError if there is none of this name."""
     check.one_of("shader", "kind", kind, SHADER_KINDS)
-    return SHADER_KINDS.index(kind)
+    return [*SHADER_KINDS].index(kind)
 
 
 class LightKind(IntEnum):

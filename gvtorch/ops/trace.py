@@ -22,7 +22,7 @@ from .arguments import RayArguments, Samples, Segments, ShadeArguments, TraceArg
 from .reference import march, shaders
 from .reference import segments as twins
 from .registry import Backend, choose_backend
-from .shading import SHADER_KINDS
+from .shading import COLOR_WIDTH, SHADER_KINDS, ShaderFacts, channel_widths
 
 _SEGMENT_BYTES = 84  # at most, in float64
 
@@ -45,7 +45,7 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
 
 def check_channel(context: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
     """Checks the fields of `TraceArguments.channel`: placement, bricks and constants."""
-    check.integer(context, "branching", arguments.branching, low=2, high=16)
+    check.integer(context, "branching", arguments.branching, low=2, high=config.MAX_BRANCHING)
     fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
     placement = _fields(arguments, torch.float64, "place_33")
     sizes = check.tensors(context, device, placement + fields)
@@ -115,15 +115,14 @@ def check_shade(
 ) -> None:
     """Checks everything that a shader reads; `user_op` is true for a user's shader."""
     context = "shade_rays"
-    kinds = ("",) if user_op else SHADER_KINDS
-    kind = kinds[check.integer(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
-    sizes = check_trace(context, rays, arguments, "lmm4" if kind == "PreIntegrated" else "lm4")
+    kinds = [ShaderFacts()] if user_op else [*SHADER_KINDS.values()]
+    facts = kinds[check.integer(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
+    sizes = check_trace(context, rays, arguments, "lmm4" if facts.integrates else "lm4")
     device, shape = rays.origin_r3.device, "k" if user_op else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(context, device, [parameters])
-    per_side = {"Filtered": 4, "FilteredLit": 10}.get(kind, 0)  # numbers seen along a direction
     # Filtered colours are those of coarse slots only, so there are fewer.
-    other_width, other_slots = 0, "e" if per_side else "b"
+    other_width, other_slots = 0, "e" if facts.filtered else "b"
     for name, bricks, constants, slots, width in (
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
         ("other", shading.other_bzyxc, shading.other_tnc, other_slots, "d"),
@@ -136,21 +135,19 @@ def check_shade(
                 fields.append((f"{name}_tnc", constants, f"tn{width}", bricks.dtype))
             other_width = check.tensors(context, device, fields, sizes).get("d", 0)
             check.integer(context, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
-    colored = sizes["c"] in (4, 24) and arguments.component == 3
-    if kind in ("StoredColor", "ShadowedColor") and not colored:
-        raise ValueError(
-            f"{context}: stored colour needs a channel of 4 or 24 numbers and component 3"
-        )
-    if kind == "Features" and not other_width:
+    one, by_direction = channel_widths(COLOR_WIDTH)
+    if facts.colored and not (sizes["c"] in (one, by_direction) and arguments.component == 3):
+        wanted = f"a channel of {one} or {by_direction} numbers and component 3"
+        raise ValueError(f"{context}: stored colour needs {wanted}")
+    if facts.features is None and not other_width:
         raise ValueError(f"{context}: features need other_bzyxc")
-    if per_side and other_width not in (per_side, 6 * per_side):
-        wanted = f"{per_side} or {6 * per_side} numbers"
-        raise ValueError(f"{context}: filtered colours need an other_bzyxc of {wanted}")
-    expected = {"Features": other_width, "Projection": 1, "Labels": 1}.get(kind, 0)
-    if user_op:
-        check.integer(context, "features", shading.features, low=0)
-    else:
-        check.integer(context, "features", shading.features, low=expected, high=expected)
+    one, by_direction = channel_widths(facts.filtered)
+    if facts.filtered and other_width not in (one, by_direction):
+        wanted = f"an other_bzyxc of {one} or {by_direction} numbers"
+        raise ValueError(f"{context}: filtered colours need {wanted}")
+    features = other_width if facts.features is None else facts.features
+    limits = {} if user_op else {"high": features}
+    check.integer(context, "features", shading.features, low=features, **limits)
     high = max(0, other_width - 1)
     check.integer(context, "other_component", shading.other_component, low=0, high=high)
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.constants import CONSTANT, TERMINAL
+from ..base.constants import CONSTANT, MAX_BRANCHING, TERMINAL
 from ..base.image_info import ImageInfo
 from ..base.labels import background
 from ..base.stage import Progress, no_progress
@@ -29,7 +29,7 @@ from .pools import (
     volumes_by_channel,
 )
 from .pyramid import TreePlan, choose_build_device, levels_by_depth, tree_depth
-from .refresh import BrickLevels
+from .refresh import BrickLevels, Span
 
 _frame_lock = threading.Lock()
 
@@ -263,7 +263,7 @@ class N3Tree:
         build_device = choose_build_device(originals.values(), device)
         volumes = {name: volume.to(build_device) for name, volume in originals.items()}
         first = next(iter(volumes.values()))
-        check.integer("from_volume", "branching", branching, low=2, high=16)
+        check.integer("from_volume", "branching", branching, low=2, high=MAX_BRANCHING)
         threshold = checked_threshold("from_volume", threshold, volumes)
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         BrickPool(0, channels, brick_size=brick_size, border=border)  # its checks, before the work
@@ -312,7 +312,7 @@ class N3Tree:
         name = self.fine_channel("N3Tree.to_volume", channel)
         z, y, x = reversed(self.extent)
         with self.turns.using("N3Tree.to_volume"):
-            data = self.levels().read(name, 0, (0, 0, 0), (z, y, x))
+            data = self.levels().read(name, 0, Span((0, 0, 0), (z, y, x)))
         table = self.labels.get(name)
         if table is not None:
             data = table[data.to(torch.int64)]
@@ -359,7 +359,7 @@ class N3Tree:
         empty = {name: background(table) for name, table in tables.items()}
         settings = filters, empty, self.spacing, self.threshold
         with self.turns.changing("N3Tree.refresh"):
-            self.levels().refresh(low[::-1], high[::-1], *settings)
+            self.levels().refresh(Span(low[::-1], high[::-1]), *settings)
             tile, child = divmod(self.root, self.nodes.nodes_per_tile)
             for name in fine:
                 ranges = self.nodes.ranges[name]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.arrays import as_volume
-from ..base.constants import ABSENT
+from ..base.constants import ABSENT, MAX_BRANCHING
 from ..base.volume import CHANNEL_DTYPES, Volume, movable
 
 _SHARED_ATTRIBUTES = ("extent", "spacing", "origin")  # what the volumes of one tree share
@@ -205,7 +205,7 @@ class NodePool(_Pool):
             ValueError: A number is out of its range, or node indices would not fit into int32.
         """
         check.integer("NodePool", "capacity", capacity, low=1)
-        check.integer("NodePool", "branching", branching, low=2, high=16)
+        check.integer("NodePool", "branching", branching, low=2, high=MAX_BRANCHING)
         n = branching**3
         if capacity * n >= 2**31:
             raise ValueError(

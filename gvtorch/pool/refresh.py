@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,6 +23,43 @@ from .pyramid import NodeSummary, coarser, node_reduction
 
 _BATCH_BRICKS = 4096  # bricks read or written at a time
 GridPosition = tuple[int, ...]  # voxels or nodes of a level, z y x
+
+
+class Span(NamedTuple):
+    """A box of voxels or nodes of a level: from `first` up to, and without, `end`."""
+
+    first: GridPosition
+    end: GridPosition
+
+    @property
+    def shape(self) -> GridPosition:
+        """Its size along each axis."""
+        return tuple(b - a for a, b in zip(*self, strict=True))
+
+    def divided(self, n: int) -> Span:
+        """Returns the cells of n^3 that hold any of it."""
+        return Span(tuple(a // n for a in self.first), tuple(-(-b // n) for b in self.end))
+
+    def scaled(self, n: int) -> Span:
+        """Returns what cells of n^3 hold."""
+        return Span(tuple(a * n for a in self.first), tuple(b * n for b in self.end))
+
+    def grown(self, margin: int) -> Span:
+        """Returns it with a margin on all sides."""
+        return Span(tuple(a - margin for a in self.first), tuple(b + margin for b in self.end))
+
+    def within(self, shape: GridPosition) -> Span:
+        """Returns the part that lies in a level of this shape."""
+        first = tuple(max(0, a) for a in self.first)
+        return Span(first, tuple(min(b, size) for b, size in zip(self.end, shape, strict=True)))
+
+    def joined(self, other: Span) -> Span:
+        """Returns the smallest box of both."""
+        return Span(tuple(map(min, self.first, other.first)), tuple(map(max, self.end, other.end)))
+
+    def slices(self, origin: GridPosition = (0, 0, 0)) -> tuple[slice, ...]:
+        """Returns where it lies in an array that begins at `origin`."""
+        return tuple(slice(a - o, b - o) for a, b, o in zip(*self, origin, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,16 +122,15 @@ class BrickLevels:
             node = torch.where(exact, tile * self.nodes.nodes_per_tile + (z * n + y) * n + x, node)
         return node, exact
 
-    def read(self, channel: str, level: int, low: GridPosition, high: GridPosition) -> Tensor:
-        """Returns voxels low to high (z, y, x, c) of a level, on the CPU. A region without a brick
-        is filled with its constant: for EMPTY ones that is their mean.
+    def read(self, channel: str, level: int, voxels: Span) -> Tensor:
+        """Returns voxels (z, y, x, c) of a level, on the CPU. A region without a brick is filled
+        with its constant: for EMPTY ones that is their mean.
         """
         size, border = self.bricks.brick_size, self.bricks.border
-        first = tuple(start // size for start in low)
-        count = tuple(-(-end // size) - start for start, end in zip(first, high, strict=True))
+        nodes = voxels.divided(size)
         stored = self.bricks.bricks[channel].detach()
         bricks, constants = movable(stored), movable(self.nodes.constants[channel]).flatten(0, 1)
-        node, exact = self.find(_grid_positions(first, count, bricks.device), level)
+        node, exact = self.find(_grid_positions(nodes, bricks.device), level)
         slot = torch.where(exact, self.slot_n[node], -1)
         inner = slice(border, border + size)
         out = bricks.new_empty((len(node), size, size, size, bricks.shape[4]))
@@ -101,66 +138,48 @@ class BrickLevels:
             has_brick = slot[part] >= 0
             out[part[~has_brick]] = constants[node[part[~has_brick]]][:, None, None, None]
             out[part[has_brick]] = bricks[slot[part[has_brick]]][:, inner, inner, inner]
-        grid = out.view(*count, size, size, size, -1).permute(0, 3, 1, 4, 2, 5, 6)
-        crop = (slice(a - size * f, b - size * f) for a, b, f in zip(low, high, first, strict=True))
-        box = grid.reshape(*(size * k for k in count), -1)[tuple(crop)]
+        grid = out.view(*nodes.shape, size, size, size, -1).permute(0, 3, 1, 4, 2, 5, 6)
+        box = grid.reshape(*nodes.scaled(size).shape, -1)
+        box = box[voxels.slices(nodes.scaled(size).first)]
         return box.contiguous().cpu().view(stored.dtype)
 
     def refresh(
         self,
-        low: GridPosition,
-        high: GridPosition,
+        changed: Span,
         filters: Mapping[str, str],
         empty: Mapping[str, float | None],
         spacing: tuple[float, float, float],
         threshold: float | None,
     ) -> None:
-        """Recomputes what depends on the finest voxels low to high (z y x).
+        """Recomputes what depends on the `changed` ones of the finest voxels.
 
         Args:
-            low: First voxel.
-            high: The one after the last.
+            changed: z y x.
             filters: For each channel, see `Volume.filter`.
             empty: For channels of labels, the value of the background.
             spacing: (x, y, z) of the finest voxels.
             threshold: See `N3Tree.from_volume`.
         """
+        if any(how != "mean" for how in filters.values()):  # constants may be no coarse voxels
+            changed = Span((0, 0, 0), self.extent)
+        levels = []  # of each: the voxels that change, and the nodes that hold any of these
+        for level in range(self.depth + 1):
+            reach = changed.grown(self.bricks.border).within(self.shape(level))
+            levels.append((changed, reach.divided(self.bricks.brick_size)))
+            changed = changed.divided(self.branching)
+        nodes_by_level = [nodes for _, nodes in levels]
         channels = [
-            _ChannelLevels(self, name, how, spacing, empty.get(name))
+            _ChannelLevels(self, name, how, spacing, empty.get(name), nodes_by_level)
             for name, how in filters.items()
         ]
-        if any(how != "mean" for how in filters.values()):  # constants may be no coarse voxels
-            low, high = (0, 0, 0), self.extent
-        begin, end = low, high
-        levels = []
-        for level in range(self.depth + 1):
-            levels.append((begin, end, *self._nodes_in_reach(level, begin, end)))
-            begin = tuple(voxel // self.branching for voxel in begin)
-            end = tuple(-(-voxel // self.branching) for voxel in end)
-        for channel in channels:
-            channel.prepare(
-                [(level, first, last) for level, (_, _, first, last) in enumerate(levels)]
-            )
-        for level, (begin, end, first, last) in enumerate(levels):
-            count = tuple(b - a for a, b in zip(first, last, strict=True))
-            position_k3 = _grid_positions(first, count, self.nodes.child_tn.device)
+        for level, (changed, nodes) in enumerate(levels):
+            position_k3 = _grid_positions(nodes, self.nodes.child_tn.device)
             node, exact = self.find(position_k3, level)
             summaries = {
-                channel.name: channel.update(level, begin, end, first, last, node, exact)
+                channel.name: channel.update(level, changed, nodes, node, exact)
                 for channel in channels
             }
             self._write(summaries, node, exact, threshold)
-
-    def _nodes_in_reach(
-        self, level: int, begin: GridPosition, end: GridPosition
-    ) -> tuple[GridPosition, GridPosition]:
-        """Returns the nodes (first, after the last) whose bricks or borders hold any of these."""
-        size, border = self.bricks.brick_size, self.bricks.border
-        first = tuple(max(0, (voxel - border) // size) for voxel in begin)
-        ends = zip(end, self.shape(level), strict=True)
-        return first, tuple(
-            -(-min(voxel + border, level_size) // size) for voxel, level_size in ends
-        )
 
     def _write(
         self,
@@ -200,125 +219,104 @@ class _ChannelLevels:
     how: str
     spacing: tuple[float, float, float]
     empty: float | None
-    _values: np.ndarray | None = None  # of the previous level
-    _begin: GridPosition = (0, 0, 0)  # their first voxel
+    nodes_by_level: Sequence[Span]  # whose content is needed
 
-    def prepare(self, node_spans: Sequence[tuple[int, GridPosition, GridPosition]]) -> None:
-        """Prepares for the nodes (first, after the last) of each level whose ranges are needed."""
+    def __post_init__(self) -> None:
         tree, size, border = self.tree, self.tree.bricks.brick_size, self.tree.bricks.border
-        steps = [tree.branching**level for level, _, _ in node_spans]
+        steps = [tree.branching**level for level in range(len(self.nodes_by_level))]
         # From this level on, a border spans whole finest bricks: their ranges are enough.
         whole_levels = (level for level, step in enumerate(steps) if border * step % size == 0)
         self._by_brick = next(whole_levels, len(steps))
-        fine_spans = [span for span in node_spans if 0 < span[0] < self._by_brick]
-        if not fine_spans:
-            return
-        align = steps[fine_spans[-1][0]]
-
-        firsts = [
-            [(node * size - border) * steps[k] for node in first] for k, first, _ in fine_spans
-        ]
-        lasts = [[(node * size + border) * steps[k] for node in last] for k, _, last in fine_spans]
-        low = [max(0, min(voxels) // align * align) for voxels in zip(*firsts, strict=True)]
-        high = [max(voxels) for voxels in zip(*lasts, strict=True)]
-        self._low = tuple(low)
-        self._high = tuple(min(b, edge) for b, edge in zip(high, tree.extent, strict=True))
+        self._values = np.empty(0)  # of the previous level
+        self._first: GridPosition = (0, 0, 0)  # their first voxel
+        # Finest voxels in reach of the nodes of the levels before, in whole voxels of these levels.
+        self._finest: Span | None = None
+        for level in range(1, self._by_brick):
+            in_reach = self.nodes_by_level[level].scaled(size).grown(border).scaled(steps[level])
+            self._finest = in_reach if self._finest is None else self._finest.joined(in_reach)
+        if self._finest is not None:
+            coarsest = steps[self._by_brick - 1]
+            aligned = self._finest.divided(coarsest).scaled(coarsest)
+            self._finest = aligned.within(tree.extent)
 
     def update(
-        self,
-        level: int,
-        begin: GridPosition,
-        end: GridPosition,
-        first: GridPosition,
-        last: GridPosition,
-        node: Tensor,
-        exact: Tensor,
+        self, level: int, changed: Span, nodes: Span, node: Tensor, exact: Tensor
     ) -> NodeSummary:
-        """Writes the bricks of a level's nodes `first` to `last`, where its voxels `begin` to `end`
-        have changed; returns the summaries (k, c) of these nodes (k,).
+        """Writes the bricks of a level's `nodes`, of which `changed` voxels have changed; returns
+        the summaries (k, c) of these nodes (k,).
+        """
+        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
+        self._make_level(level, changed, nodes)
+        padded = self._with_borders(self._values, self._first, nodes)
+        self._write_bricks(padded, node, exact)
+        inner = padded[tuple(slice(border, side - border) for side in padded.shape[:3])]
+        mean = reduce_windows(inner, node_reduction(self.how), size=size, step=size)
+        parts = (*self._ranges(level, nodes, padded), mean)
+        flat = [torch.from_numpy(part.astype(np.float32)).flatten(0, 2) for part in parts]
+        return NodeSummary(*flat)
+
+    def _make_level(self, level: int, changed: Span, nodes: Span) -> None:
+        """Makes the voxels of a level's nodes and borders, and those that the next level is made
+        of: the changed ones from the level before, others are read.
         """
         tree, n = self.tree, self.tree.branching
         size, border, shape = tree.bricks.brick_size, tree.bricks.border, tree.shape(level)
-        low = tuple(max(0, index * size - border) for index in first)
-        high = tuple(
-            min(index * size + border, edge) for index, edge in zip(last, shape, strict=True)
-        )
-        ends = zip(end, tree.shape(level + 1), strict=True)
-        coarse_begin = tuple(index // n for index in begin)
-        coarse_end = tuple(min(-(-index // n), edge) for index, edge in ends)
-        low = tuple(min(a, b * n) for a, b in zip(low, coarse_begin, strict=True))
-        grown = zip(high, coarse_end, shape, strict=True)
-        high = tuple(min(max(a, b * n), edge) for a, b, edge in grown)
-        values = self._make_level(level, begin, end, low, high)
-        self._values, self._begin = values, low
-        padded = _with_borders(values, low, first, last, size, border)
-        self._write_bricks(padded, node, exact)
-        if level == 0:
-            smallest = largest = padded
-        elif level < self._by_brick:
-            smallest, largest = (
-                _with_borders(
-                    extremes,
-                    tuple(index // n**level for index in self._low),
-                    first,
-                    last,
-                    size,
-                    border,
-                )
+        needed = nodes.scaled(size).grown(border).joined(changed.divided(n).scaled(n))
+        needed = needed.within(shape)
+        if level == 0 or needed != changed:
+            values = to_numpy(tree.read(self.name, level, needed))
+        if level > 0:
+            source = changed.scaled(n).within(tree.shape(level - 1)).slices(self._first)
+            dtype = tree.bricks.bricks[self.name].dtype
+            arguments = self.how, n, dtype, self.spacing, level
+            coarse = coarser(self._values[source], *arguments, empty=self.empty)
+            if needed == changed:
+                values = coarse
+            else:
+                values[changed.slices(needed.first)] = coarse
+        self._values, self._first = values, needed.first
+
+    def _with_borders(self, values: np.ndarray, first: GridPosition, nodes: Span) -> np.ndarray:
+        """Returns the voxels of nodes with their borders, from `values`, which begin at voxel
+        `first`; the outermost voxels are repeated.
+        """
+        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
+        for axis, part in enumerate(nodes.scaled(size).grown(border).slices(first)):
+            inside = max(0, part.start)
+            values = values[(slice(None),) * axis + (slice(inside, part.stop),)]
+            after = part.stop - inside - values.shape[axis]
+            values = extend(values, axis, inside - part.start, after)
+        return values
+
+    def _ranges(self, level: int, nodes: Span, padded: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the smallest and the largest finest value in reach of a level's nodes, whose
+        voxels with their borders are `padded`.
+        """
+        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
+        n = self.tree.branching**level
+        if level >= self._by_brick:
+            low, high = self._brick_ranges
+            reach, in_level = border * n // size, nodes.slices()
+            return by_node(low, "min", n, reach)[in_level], by_node(high, "max", n, reach)[in_level]
+        low = high = padded
+        if level > 0:
+            assert self._finest is not None
+            first = self._finest.divided(n).first
+            low, high = (
+                self._with_borders(extremes, first, nodes)
                 for extremes in self._finest_extremes(level)
             )
-        inner = padded[tuple(slice(border, s - border) for s in padded.shape[:3])]
-        mean = reduce_windows(inner, node_reduction(self.how), size=size, step=size)
-        if level < self._by_brick:
-            window = {"size": size + 2 * border, "step": size}
-            ranges = [
-                reduce_windows(smallest, "min", **window),
-                reduce_windows(largest, "max", **window),
-            ]
-        else:
-            node_slices = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
-            reach = border * n**level // size
-            smallest, largest = self._brick_ranges
-            ranges = [
-                by_node(smallest, "min", n**level, reach)[node_slices],
-                by_node(largest, "max", n**level, reach)[node_slices],
-            ]
-        flat = [torch.from_numpy(part.astype(np.float32)).flatten(0, 2) for part in (*ranges, mean)]
-        return NodeSummary(*flat)
-
-    def _make_level(
-        self,
-        level: int,
-        begin: GridPosition,
-        end: GridPosition,
-        low: GridPosition,
-        high: GridPosition,
-    ) -> np.ndarray:
-        """Returns voxels low to high of a level, begin to end of them made from the one before."""
-        n = self.tree.branching
-        if level == 0:
-            return to_numpy(self.tree.read(self.name, 0, low, high))
-        assert self._values is not None
-        finer_shape = self.tree.shape(level - 1)
-        ends = zip(end, finer_shape, self._begin, strict=True)
-        source = tuple(
-            slice(a * n - start, min(b * n, edge) - start)
-            for a, (b, edge, start) in zip(begin, ends, strict=True)
+        side = size + 2 * border
+        return (
+            reduce_windows(low, "min", size=side, step=size),
+            reduce_windows(high, "max", size=side, step=size),
         )
-        dtype = self.tree.bricks.bricks[self.name].dtype
-        arguments = self.how, n, dtype, self.spacing, level
-        coarse = coarser(self._values[source], *arguments, empty=self.empty)
-        if (low, high) == (begin, end):
-            return coarse
-        values = to_numpy(self.tree.read(self.name, level, low, high))
-        inside = (slice(a - z, b - z) for a, b, z in zip(begin, end, low, strict=True))
-        values[tuple(inside)] = coarse
-        return values
 
     def _finest_extremes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the smallest and largest finest value of a level's voxels, near what changes."""
         if level == 1:
-            self._extremes = (to_numpy(self.tree.read(self.name, 0, self._low, self._high)),) * 2
+            assert self._finest is not None
+            self._extremes = (to_numpy(self.tree.read(self.name, 0, self._finest)),) * 2
         low, high = self._extremes
         n = self.tree.branching
         self._extremes = (pool_min(low, n), pool_max(high, n))
@@ -329,8 +327,8 @@ class _ChannelLevels:
         """The smallest and largest voxel of each finest brick without its border, (z, y, x, c)."""
         tree, size, border = self.tree, self.tree.bricks.brick_size, self.tree.bricks.border
         stored = tree.bricks.bricks[self.name].detach()
-        grid = tuple(-(-n // size) for n in tree.extent)
-        node, exact = tree.find(_grid_positions((0, 0, 0), grid, stored.device), 0)
+        finest = Span((0, 0, 0), tree.extent).divided(size)
+        node, exact = tree.find(_grid_positions(finest, stored.device), 0)
         slot = torch.where(exact, tree.slot_n[node], -1)
         constant = movable(tree.nodes.constants[self.name]).flatten(0, 1)[node]
         low = constant.view(stored.dtype).to(torch.float32)
@@ -339,8 +337,8 @@ class _ChannelLevels:
             bricks = movable(stored)[slot[part]].view(stored.dtype)
             voxels = bricks[:, inner, inner, inner].to(torch.float32).flatten(1, 3)
             low[part], high[part] = torch.aminmax(voxels, dim=1)
-        smallest, largest = (extremes.view(*grid, -1).cpu().numpy() for extremes in (low, high))
-        return smallest, largest
+        grid = (*finest.shape, -1)
+        return low.view(grid).cpu().numpy(), high.view(grid).cpu().numpy()
 
     def _write_bricks(self, padded: np.ndarray, node: Tensor, exact: Tensor) -> None:
         """Writes the bricks (with borders) of nodes (k,), whose voxels lie in `padded` in order."""
@@ -367,26 +365,7 @@ def _pointed_or_owned(words: Tensor, owner: Tensor) -> Tensor:
     return pointed_n
 
 
-def _grid_positions(first: GridPosition, count: GridPosition, device: torch.device) -> Tensor:
-    """Returns (k, 3) int64 z y x of a grid, in order."""
-    axes = [torch.arange(a, a + k, device=device) for a, k in zip(first, count, strict=True)]
+def _grid_positions(span: Span, device: torch.device) -> Tensor:
+    """Returns (k, 3) int64 z y x of all positions in a box, in order."""
+    axes = [torch.arange(a, b, device=device) for a, b in zip(*span, strict=True)]
     return torch.cartesian_prod(*axes).view(-1, 3)
-
-
-def _with_borders(
-    values: np.ndarray,
-    low: GridPosition,
-    first: GridPosition,
-    last: GridPosition,
-    size: int,
-    border: int,
-) -> np.ndarray:
-    """Returns the voxels of nodes `first` to `last` with their borders, from `values`, which begin
-    at voxel `low`; the outermost voxels are repeated.
-    """
-    for axis, start in enumerate(low):
-        begin, end = first[axis] * size - border - start, last[axis] * size + border - start
-        inside = max(0, begin)
-        values = values[(slice(None),) * axis + (slice(inside, end),)]
-        values = extend(values, axis, inside - begin, end - inside - values.shape[axis])
-    return values

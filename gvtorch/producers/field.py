@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ..base import check
 from ..base.boxes import extent_in
-from ..base.constants import DEEP_VOXELS
+from ..base.constants import DEEP_VOXELS, MAX_EXTENT
 from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
@@ -411,7 +411,7 @@ def _grid(
     around = around.cpu()
     sides, middle = around[1] - around[0], around.mean(0)
     if isinstance(extent, int):
-        check.integer(context, "extent", extent, low=5, high=2**40)
+        check.integer(context, "extent", extent, low=5, high=MAX_EXTENT)
         voxel = sides.max() / (extent - 4)
         extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
         half_size = torch.tensor(extent, dtype=torch.float64) * voxel / 2

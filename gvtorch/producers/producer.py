@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.constants import MAX_BRANCHING, MAX_EXTENT
 from ..base.volume import Volume, movable
 from ..pool import Channel
 from ..pool.pools import phrase
@@ -222,7 +223,7 @@ class Producer(torch.nn.Module):
         sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
         if len(sizes) != 3:
             raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.integer(context, "extent", size, low=1, high=2**40) for size in sizes)
+        x, y, z = (check.integer(context, "extent", size, low=1, high=MAX_EXTENT) for size in sizes)
         self.extent = (x, y, z)
         if box is not None:
             low, high = check.box(context, box)
@@ -231,7 +232,7 @@ class Producer(torch.nn.Module):
         if isinstance(spacing, (int, float)):
             spacing = (spacing,) * 3
         self.spacing, self.origin = check.grid_placement(context, spacing, origin, self.extent)
-        self.branching = check.integer(context, "branching", branching, low=2, high=16)
+        self.branching = check.integer(context, "branching", branching, low=2, high=MAX_BRANCHING)
         if channels is not None and not isinstance(channels, Mapping):
             kind = type(channels).__name__
             raise ValueError(f"{context}: channels must be Channel objects by name, got a {kind}")

@@ -17,6 +17,7 @@ from ..base import check
 from ..base.checked import Check, class_name, flag, instance_of, name_text, optional, positive
 from ..ops import ShadeArguments
 from ..ops.shading import (
+    COLOR_WIDTH,
     GradientMagnitudeNumbers,
     IsosurfaceNumbers,
     Number,
@@ -24,6 +25,7 @@ from ..ops.shading import (
     ProjectionNumbers,
     StoredColorNumbers,
     Triple,
+    channel_widths,
     pack,
 )
 from ..pool import Channel, N3Tree
@@ -165,7 +167,7 @@ class StoredColor(LitShader):
     def own_numbers(self, tree: N3Tree) -> StoredColorNumbers:
         scale = 1 / number_of_one(tree.bricks.channels[str(self.channel)].dtype)
         reference = self.reference or min(tree.spacing)
-        directional = tree.bricks.channels[str(self.channel)].width != 4
+        directional = tree.bricks.channels[str(self.channel)].width != COLOR_WIDTH
         return StoredColorNumbers(
             scale=scale,
             reference=reference,
@@ -185,13 +187,14 @@ class StoredColor(LitShader):
         return blocker
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
-        channel = tree.bricks.channels.get(str(self.channel), Channel(width=4))
-        if channel.width not in (4, 24):
+        one, by_direction = channel_widths(COLOR_WIDTH)
+        width = tree.bricks.channels.get(str(self.channel), Channel(width=one)).width
+        if width not in (one, by_direction):
             raise ValueError(
-                f"{context}: stored colour needs 4 numbers a voxel, or 24 for six directions, "
-                f"{self.channel!r} has {channel.width}"
+                f"{context}: stored colour needs {one} numbers a voxel, or {by_direction} for six "
+                f"directions, {self.channel!r} has {width}"
             )
-        if channel.width == 24 and self.reference not in (None, min(tree.spacing)):
+        if width == by_direction and self.reference not in (None, min(tree.spacing)):
             raise ValueError(
                 f"{context}: {self.channel!r} has six directions, so its opacity is that of the "
                 f"smallest spacing, {min(tree.spacing):g}; got reference {self.reference:g}"
@@ -271,10 +274,11 @@ class Isosurface(LitShader):
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         self._check_color()
         if self.color is None:
-            width = tree.bricks.channels.get(str(self.other), Channel(width=4)).width
-            if width != 4:
+            width = tree.bricks.channels.get(str(self.other), Channel(width=COLOR_WIDTH)).width
+            if width != COLOR_WIDTH:
                 raise ValueError(
-                    f"{context}: stored colour needs 4 numbers a voxel, {self.other!r} has {width}"
+                    f"{context}: stored colour needs {COLOR_WIDTH} numbers a voxel, "
+                    f"{self.other!r} has {width}"
                 )
         return super().shading(context, tree)
 
@@ -427,9 +431,6 @@ class Projection(Shader):
     def own_numbers(self, tree: N3Tree) -> ProjectionNumbers:
         return ProjectionNumbers(ProjectionKind[self.which.upper()])
 
-    def feature_count(self, tree: N3Tree) -> int:
-        return 1
-
 
 class Features(Shader):
     """All c numbers of a channel, composited front to back with the transfer function's alpha and
@@ -445,9 +446,6 @@ class Features(Shader):
     def __init__(self, transfer: TransferFunction, channel: str) -> None:
         """Sets the transfer function of the density, and the name of the channel of features."""
         self.transfer, self.other = transfer, channel
-
-    def feature_count(self, tree: N3Tree) -> int:
-        return tree.bricks.channels[str(self.other)].width
 
 
 class GradientMagnitude(Shader):

@@ -16,17 +16,13 @@ import torch
 from torch import Tensor
 
 from ..base.stage import Progress
-from ..base.volume import Volume, movable
-from ..ops.shading import FAINT
+from ..base.volume import DIRECTIONS, Volume, movable
+from ..ops.shading import COLOR_WIDTH, FAINT, LIT_COLOR_WIDTH
 from .shader import ColorTable
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # finest voxels that are processed at a time
 _MIN_LIGHT = 0.001  # weight of a column that no light reaches
 _HIDDEN_BELOW = 0.5  # a voxel with less than this share of its neighbours' light is hidden
-_DIRECTIONS = 6
-#: Numbers of a voxel seen along one direction: premultiplied colour and alpha; then, for lit
-#: matter, the mean products xx xy xz yy yz zz of the components of its normals, premultiplied.
-PLAIN, LIT = 4, 10
 
 
 class FinestVoxels(Protocol):
@@ -71,7 +67,7 @@ def write_colors(
     all_light: bool,
 ) -> None:
     """Writes the colours of the coarse levels, the finest of them first, (z, y, x, 6 * (n + 1))
-    float16 each: for each of the directions +x -x +y -y +z -z, the n numbers (PLAIN or LIT) of a
+    float16 each: for each of `DIRECTIONS`, the n numbers (COLOR_WIDTH or LIT_COLOR_WIDTH) of a
     voxel seen in it, over a length of the smallest spacing, and the share of light that reached it.
 
     Columns are weighted by the light that reaches them in a voxel. With `all_light` everything
@@ -80,13 +76,13 @@ def write_colors(
     may see what no light reaches along an axis, so else only the voxel in front dims the light.
     """
     done, total = 0, 3 * math.prod(field.shape)
-    numbers = out[0].shape[-1] // _DIRECTIONS if out else 0
+    numbers = out[0].shape[-1] // len(DIRECTIONS) if out else 0
     for axis, table in enumerate(tables):
         column_axis, length_ratio = 2 - axis, min(spacing) / spacing[axis]
         sizes = [spacing[2 - a] for a in (column_axis, *(a for a in range(3) if a != column_axis))]
-        painter = _Painter(table, sizes if numbers == LIT + 1 else None, column_axis)
+        painter = _Painter(table, sizes if numbers == LIT_COLOR_WIDTH + 1 else None, column_axis)
         axis_levels = [
-            level.unflatten(-1, (_DIRECTIONS, -1))[..., 2 * axis : 2 * axis + 2, :]
+            level.unflatten(-1, (len(DIRECTIONS), -1))[..., 2 * axis : 2 * axis + 2, :]
             .movedim(column_axis, 0)
             .movedim(3, 0)
             for level in out
@@ -117,7 +113,8 @@ def _sums_along(
 ) -> Iterator[tuple[int, int, int, Tensor]]:
     """Yields blocks of coarse voxels, each voxel once, seen along an axis of the field: the level
     (0: finest coarse one), the block's first indices a, b across the axis, and weighted sums
-    (2, c + 1, n, a, b), seen forwards and backwards: c numbers (see `LIT`) and the weight.
+    (2, c + 1, n, a, b), seen forwards and backwards: the c numbers of a colour and the
+    weight.
     """
     device = painter.table.table_lm4.device
     length = field.shape[column_axis]
@@ -334,8 +331,8 @@ class _Painter:
 
     @property
     def width(self) -> int:
-        """How many numbers an interval has: PLAIN or LIT."""
-        return PLAIN if self.voxel_sizes is None else LIT
+        """How many numbers an interval has: COLOR_WIDTH or LIT_COLOR_WIDTH."""
+        return COLOR_WIDTH if self.voxel_sizes is None else LIT_COLOR_WIDTH
 
     def colored(self, padded_values: Tensor) -> _Columns:
         """Returns intervals of half a voxel, coloured from (n, a + 2, b + 2) values, which have
@@ -382,7 +379,7 @@ def _pooled(values: Tensor, block: int) -> Tensor:
 
 def without_light(colors: Tensor) -> Tensor:
     """Drops the shares of light: returns (..., 6 * n) of `write_colors`' (..., 6 * (n + 1))."""
-    return colors.unflatten(-1, (_DIRECTIONS, -1))[..., :-1].flatten(-2)
+    return colors.unflatten(-1, (len(DIRECTIONS), -1))[..., :-1].flatten(-2)
 
 
 def mean_of_directions(colors: Tensor) -> Tensor:
@@ -390,12 +387,12 @@ def mean_of_directions(colors: Tensor) -> Tensor:
     which the shader multiplies their trace by: light reaches all of such matter, so the product is
     the share of it that has a normal.
     """
-    first, *others = colors.split(colors.shape[-1] // _DIRECTIONS, -1)
+    first, *others = colors.split(colors.shape[-1] // len(DIRECTIONS), -1)
     total = first.float()
     for direction in others:
         total += direction
-    mean = total / _DIRECTIONS
-    mean[..., PLAIN:] /= FAINT
+    mean = total / len(DIRECTIONS)
+    mean[..., COLOR_WIDTH:] /= FAINT
     return mean.to(colors.dtype)
 
 

@@ -29,17 +29,22 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, class_name, whole_between
 from ..base.stage import Progress, no_progress
-from ..base.volume import Volume
+from ..base.volume import DIRECTIONS, Volume
 from ..io.stores.coarse import make_channel
 from ..io.stores.store import Store
 from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
-from ..ops.shading import FilteredNumbers, ShadeParameters, shader_number
+from ..ops.shading import (
+    COLOR_WIDTH,
+    LIT_COLOR_WIDTH,
+    FilteredNumbers,
+    ShadeParameters,
+    channel_widths,
+    shader_number,
+)
 from ..pool import Channel, N3Tree
 from .built_in import Lit
 from .coarse_colors import (
-    LIT,
-    PLAIN,
     FinestVoxels,
     VolumeField,
     mean_of_directions,
@@ -206,7 +211,7 @@ class Filtered(Shader):
         shader = cls(transfer, channel, component, directions=directions)
         torch_device = check.device("Filtered", device)
         color_channel, made_of = shader.colors(opened.spacing), shader.made_of
-        voxel_width = 6 * (shader.numbers + 1)
+        voxel_width = len(DIRECTIONS) * (shader.numbers + 1)  # see `write_colors`
 
         def fill(levels: Sequence[np.ndarray]) -> None:
             out = [torch.from_numpy(level) for level in levels]
@@ -239,8 +244,9 @@ class Filtered(Shader):
         names = ("opacity", "color", "reference", "component")
         lit = coarse.made_of.get("normals") is True
         expected_keys = sorted((*names, "normals") if lit else names)
-        numbers = LIT if lit else PLAIN
-        if sorted(coarse.made_of) != expected_keys or coarse.width not in (numbers, 6 * numbers):
+        numbers = LIT_COLOR_WIDTH if lit else COLOR_WIDTH
+        widths = channel_widths(numbers)
+        if sorted(coarse.made_of) != expected_keys or coarse.width not in widths:
             raise ValueError(f"{opened.location}: damaged: {channel!r} holds no filtered colours")
         opacity, color, reference, component = (coarse.made_of[name] for name in names)
         try:
@@ -258,8 +264,8 @@ class Filtered(Shader):
 
     @property
     def numbers(self) -> int:
-        """How many numbers a voxel has along one direction: PLAIN or LIT."""
-        return LIT if isinstance(self.transfer, Lit) else PLAIN
+        """How many numbers a voxel has along one direction: COLOR_WIDTH or LIT_COLOR_WIDTH."""
+        return LIT_COLOR_WIDTH if isinstance(self.transfer, Lit) else COLOR_WIDTH
 
     @property
     def made_of(self) -> dict[str, Any]:
@@ -271,7 +277,7 @@ class Filtered(Shader):
             "reference": function.reference,
             "component": self.component,
         }
-        return description if self.numbers == PLAIN else {**description, "normals": True}
+        return description if self.numbers == COLOR_WIDTH else {**description, "normals": True}
 
     def colors(self, spacing: tuple[float, float, float]) -> Channel:
         """Returns dtype and width of the channel of colours, for voxels of this size."""
@@ -280,7 +286,8 @@ class Filtered(Shader):
             one_voxel = Sampling(smallest_spacing=min(spacing), step=min(spacing))
             table = self.transfer.table(one_voxel)
             directions = float(table.table_lm4[0, :, 3].max()) > _OPAQUE_ALPHA
-        return Channel(torch.float16, self.numbers * (6 if directions else 1), coarse=True)
+        one, by_direction = channel_widths(self.numbers)
+        return Channel(torch.float16, by_direction if directions else one, coarse=True)
 
     def levels(
         self,
@@ -297,7 +304,7 @@ class Filtered(Shader):
         field = VolumeField(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
         shapes = [[-(-n // side) for n in field.shape] for side in sides]
-        voxel_width = 6 * (self.numbers + 1)
+        voxel_width = len(DIRECTIONS) * (self.numbers + 1)  # see `write_colors`
         out = [torch.empty((*n, voxel_width), dtype=torch.float16, device=device) for n in shapes]
         self.write(field, volume.spacing, branching, out, device, progress)
         for colors in out:
@@ -333,7 +340,7 @@ class Filtered(Shader):
         channel = tree.bricks.channels.get(str(self.other))
         if channel is not None and channel.width > self.numbers:
             return _FINER_BY_DIRECTION
-        return _FINER if self.numbers == PLAIN else _FINER_LIT
+        return _FINER if self.numbers == COLOR_WIDTH else _FINER_LIT
 
     def own_numbers(self, tree: N3Tree) -> FilteredNumbers:
         return FilteredNumbers(min(tree.spacing) * tree.side)
@@ -362,15 +369,15 @@ class Filtered(Shader):
                 "component, or it was edited: make them again (Filtered.of, Filtered.add_to, a new "
                 "producer)"
             )
-        numbers = self.numbers
-        channel = tree.bricks.channels.get(str(self.other), Channel(width=numbers))
-        if channel.width not in (numbers, 6 * numbers):
+        one, by_direction = channel_widths(self.numbers)
+        width = tree.bricks.channels.get(str(self.other), Channel(width=one)).width
+        if width not in (one, by_direction):
             raise ValueError(
-                f"{context}: filtered colours need {numbers} numbers a voxel, or {6 * numbers} for "
-                f"six directions, {self.other!r} has {channel.width}"
+                f"{context}: filtered colours need {one} numbers a voxel, or {by_direction} for "
+                f"six directions, {self.other!r} has {width}"
             )
         arguments = super().shading(context, tree)
-        if arguments is None or self.numbers == PLAIN:
+        if arguments is None or one == COLOR_WIDTH:
             return arguments
         return arguments._replace(shader=shader_number(self.lit_kind))
 

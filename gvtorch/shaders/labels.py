@@ -108,9 +108,6 @@ class Labels(LitShader):
     def own_numbers(self, tree: N3Tree) -> LabelNumbers:
         return LabelNumbers(lit=float(self.lit))
 
-    def feature_count(self, tree: N3Tree) -> int:
-        return 1
-
     def unlit(self) -> Self:
         unlit = super().unlit()
         unlit.lit = True

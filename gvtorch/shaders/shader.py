@@ -16,7 +16,15 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, Checked, flag, name_text, optional, whole_between
 from ..ops import ShadeArguments
-from ..ops.shading import Number, ShadeParameters, Triple, pack, shader_number
+from ..ops.shading import (
+    SHADER_KINDS,
+    Number,
+    ShadeParameters,
+    ShaderFacts,
+    Triple,
+    pack,
+    shader_number,
+)
 from ..pool import N3Tree
 
 _MAX_TABLE_BYTES = 64 * 2**20  # limit for a table in float32
@@ -170,7 +178,8 @@ class Shader(Checked):
 
     def feature_count(self, tree: N3Tree) -> int:
         """Returns the width c of `Hits.features` (r, c)."""
-        return 0
+        features = SHADER_KINDS.get(str(self.kind), ShaderFacts()).features
+        return tree.bricks.channels[str(self.other)].width if features is None else features
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
         """Returns `parameter_54` of `shade_rays` from the current light and material, after

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from ..base.volume import Volume
     from ..cameras import Camera
-    from ..cameras.camera import Up
     from ..cameras.models import CameraModel
+    from ..cameras.poses import Up
     from ..io.stores.store import Store
     from ..shaders import Shader, StoredColor
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.records import Hits, Rays
-from ..cameras.camera import Frame
+from ..cameras.poses import Coordinates
 from .composite import TraceRays, indices_if_few, reaches_depth, scatter_hits, trace_pieces
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
@@ -35,20 +35,20 @@ class Clip:
     planes: Numbers = ()  # (p, 4): (a, b, c, d) keeps where a x + b y + c z + d >= 0
     boxes: Sequence[Numbers] = ()  # to keep
     without: Sequence[Numbers] = ()  # to remove
-    frame: Frame | str = Frame.WORLD  # world units, or the scene's box: centre 0, largest side 1
+    frame: Coordinates | str = Coordinates.WORLD  # or the scene's box: centre 0, largest side 1
     caps: bool = False  # draws a flat surface where a cut passes through matter
     cap_opacity: float = 1.0  # of caps
     cap_light: float = 0.5  # share of caps' light that comes from the eye; without `Lighting` only
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frame", Frame.of("Clip", self.frame))
+        object.__setattr__(self, "frame", Coordinates.of("Clip", self.frame))
         check.number("Clip", "cap_opacity", self.cap_opacity, low=0, high=1, open_low=True)
         check.number("Clip", "cap_light", self.cap_light, low=0, high=1)
         _ = self._checked_faces
 
     def __repr__(self) -> str:
         counts = [f"{name}={len(getattr(self, name))}" for name in Faces._fields]
-        frame = Frame(self.frame).value
+        frame = Coordinates(self.frame).value
         return f"Clip({', '.join(counts)}, caps={self.caps}, in {frame} units)"
 
     @property
@@ -72,9 +72,9 @@ class Clip:
 
     def faces(self, box: Tensor) -> Faces:
         """Returns the faces in world units, given the (2, 3) box of the scene."""
-        if self.frame is Frame.WORLD:
+        if self.frame is Coordinates.WORLD:
             return self._checked_faces
-        centre, side = ((box[0] + box[1]) / 2).tolist(), Frame.BOX.unit(box)
+        centre, side = ((box[0] + box[1]) / 2).tolist(), Coordinates.BOX.unit(box)
 
         def to_world(faces: list[Face]) -> list[Face]:
             return [(*n, d * side - _dot(n, centre)) for *n, d in faces]

@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 
 from ..base import check
 from ..base.records import Hits, Rays
-from ..cameras.camera import Frame
+from ..cameras.poses import Coordinates
 from ..ops import RayArguments
 from ..ops.reference.exact import dot, unit
 from ..ops.shading import ShadeParameters, Triple, pack
@@ -68,7 +68,7 @@ class Lighting:
     indirect: float = 0.0  # factor of the light that comes from lit matter nearby
     cones: int = 16  # over the hemisphere, for occlusion and indirect light
     reach: float | None = None  # of occlusion and indirect light; None: a quarter of the box's side
-    frame: Frame | str = Frame.WORLD  # of reach: world units, or largest sides of the scene's box
+    frame: Coordinates | str = Coordinates.WORLD  # of reach: or largest sides of the scene's box
     ambient: Triple = (1.0, 1.0, 1.0)  # light from all directions, linear RGB
 
     def __post_init__(self) -> None:
@@ -85,15 +85,17 @@ class Lighting:
         check.integer(context, "cones", self.cones, low=1, high=1024)
         if self.reach is not None:
             check.number(context, "reach", self.reach, low=0, open_low=True)
-        object.__setattr__(self, "frame", Frame.of(context, self.frame))
+        object.__setattr__(self, "frame", Coordinates.of(context, self.frame))
         a_triple(low=0)(self, "ambient", self.ambient)
 
     __repr__ = check.summary
 
     def placed(self, box: Tensor) -> Lighting:
         """Returns the lighting with its reach in world units, given the scene's (2, 3) box."""
-        frame, reach = (Frame.BOX, 0.25) if self.reach is None else (Frame(self.frame), self.reach)
-        return replace(self, reach=reach * frame.unit(box), frame=Frame.WORLD)
+        frame, reach = Coordinates(self.frame), self.reach
+        if reach is None:
+            frame, reach = Coordinates.BOX, 0.25
+        return replace(self, reach=reach * frame.unit(box), frame=Coordinates.WORLD)
 
 
 @dataclass(frozen=True)

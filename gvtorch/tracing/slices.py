@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ..base import check
+from ..base.constants import MAX_PICTURE_SIDE
 from ..base.records import RenderStats
 from ..base.units import length_unit, metres
 from ..base.volume import Volume, to_numpy
@@ -41,7 +42,6 @@ _RADIOLOGICAL_PLANES = {
     "R": ("sagittal", "S", "A"),
 }
 _GAP = 4  # pixels between the three planes
-_MAX_PIXELS = 65536  # pixels along a side
 
 
 def slice_picture(
@@ -89,7 +89,7 @@ def slice_picture(
     context = "slice_picture"
     check.one_of(context, "axis", axis, ("x", "y", "z", "all"))
     check.instance(context, "data", data, Volume, Store)
-    scale = check.number(context, "scale", scale, low=0, high=_MAX_PIXELS, open_low=True)
+    scale = check.number(context, "scale", scale, low=0, high=MAX_PICTURE_SIDE, open_low=True)
     reader = _PlaneReader(data, component, level)
     colors = _colors(data, span, colors, component)
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
@@ -289,9 +289,9 @@ class _PlaneReader:
 def _voxel_of_pixels(count: int, size: float) -> np.ndarray:
     """Returns the voxel of each pixel along an axis, for `count` voxels of `size` pixels each."""
     pixels = max(1, round(count * size))
-    if pixels > _MAX_PIXELS:
+    if pixels > MAX_PICTURE_SIDE:
         raise ValueError(
-            f"slice_picture: {pixels} pixels are more than {_MAX_PIXELS}: use a smaller scale"
+            f"slice_picture: {pixels} pixels are more than {MAX_PICTURE_SIDE}: use a smaller scale"
         )
     return ((np.arange(pixels) + 0.5) * (count / pixels)).astype(np.int64)
 

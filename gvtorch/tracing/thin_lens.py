@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.records import Hits, Rays
-from ..cameras.camera import Frame
+from ..cameras.poses import Coordinates
 from .composite import TraceRays, trace_pieces
 
 #: Width of the cone over the diameter of the circle of confusion. Voxels half as wide as the
@@ -38,18 +38,18 @@ class ThinLens:
 
     aperture: float  # diameter of the lens
     focus: float  # distance at which things are sharp
-    frame: Frame | str = Frame.WORLD  # world units, or largest sides of the scene's box
+    frame: Coordinates | str = Coordinates.WORLD  # or largest sides of the scene's box
 
     def __post_init__(self) -> None:
         check.number("ThinLens", "aperture", self.aperture, low=0)
         check.number("ThinLens", "focus", self.focus, low=0, open_low=True)
-        object.__setattr__(self, "frame", Frame.of("ThinLens", self.frame))
+        object.__setattr__(self, "frame", Coordinates.of("ThinLens", self.frame))
 
     __repr__ = check.summary
 
     def placed(self, box: Tensor) -> ThinLens:
         """Returns the lens in world units, given the (2, 3) box of the scene."""
-        unit = Frame(self.frame).unit(box)
+        unit = Coordinates(self.frame).unit(box)
         return ThinLens(aperture=self.aperture * unit, focus=self.focus * unit)
 
     def cone(self, t: Tensor) -> Tensor:

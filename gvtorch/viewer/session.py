@@ -18,7 +18,7 @@ import torch
 from ..base.messages import one_line
 from ..base.volume import Volume
 from ..cameras import Camera
-from ..cameras.camera import Up, upward
+from ..cameras.poses import Up, upward
 from ..engine import EngineOptions
 from ..io.stores.store import Store
 from ..pictures import Picture

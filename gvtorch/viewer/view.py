@@ -14,7 +14,7 @@ from typing import Any, Unpack
 from ..base import check
 from ..base.explicit import explicit
 from ..cameras import Camera
-from ..cameras.camera import Up
+from ..cameras.poses import Up
 from ..pictures.picture import in_notebook
 from ..shaders import Shader
 from ..tracing import RenderOptions

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from .exact import absorbed_by, clamp, larger
+from .lit import Lit
 from .march import Piece, Probe, Transfer
 from .tree import ChannelBricks
 
@@ -71,3 +72,21 @@ class ChannelTable:
         alpha = absorbed_by(torch.where(piece.odd, total * piece.lengths, total))
         scale = alpha / torch.where(total > 0, total, 1.0)
         return torch.cat((color * scale[:, None], alpha[:, None]), 1)
+
+
+class ChannelMix(Lit):
+    """Several numbers of a voxel, each with its transfer function."""
+
+    bricks = AllNumbers
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.table = ChannelTable(self.transfer)
+
+    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        return self.table.transparent(low, high)
+
+    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+        rgba = self.table.interval(piece, probe)
+        self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], mask)
+        self.sum.absorb(rgba[:, 3], piece, mask)

@@ -1,13 +1,17 @@
-"""Part of the torch twin: nearest voxels, for labels, as in csrc/shaders/labels.h."""
+"""Part of the torch twin: labels, read from the nearest voxel, as in csrc/shaders/labels.h."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from .exact import clamp, larger, smaller
+from ..shading import LabelNumbers
+from .exact import clamp, dot, larger, smaller, stretch, unit
+from .lit import Lit
+from .march import Piece, Probe
 from .rays import INF, Beam
 from .tree import ChannelBricks, Holder
 
@@ -87,3 +91,62 @@ class LabelBricks(ChannelBricks):
             y = y + weights[k + reach][2] * along_y
             z = z + moments[k + reach][2] * plane
         return torch.stack((x, y, z), 1)
+
+
+class Labels(Lit):
+    """The label of the nearest voxel."""
+
+    bricks = LabelBricks
+    channel: LabelBricks
+
+    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        first, last = self.row_of(low), self.row_of(high)
+        before = self.transfer.opaque_m[(first - 1).clamp(min=0)]
+        return self.transfer.opaque_m[last] == torch.where(first > 0, before, 0)
+
+    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+        fine, coarse = probe.nodes.fine, probe.nodes.coarse
+        blended = probe.blend(piece.middle, partial(self.contribution, piece, probe))
+        color, alpha, normal = blended.split((3, 1, 3), 1)
+        hidden = ~(self.contribution(piece, probe, fine)[:, 3] > 0)
+        holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
+        label = self.row_of(self.channel.nearest(holder, probe.beam, piece.middle).value)
+        clear_after, clear, hit_clear = (
+            self.sum.clear * (1 - alpha[:, 0]),
+            self.sum.clear,
+            self.sum.hit_clear,
+        )
+        hit = mask & (clear_after < hit_clear) & (clear >= hit_clear)
+        self.features = torch.where(hit[:, None], (1 + label)[:, None].to(alpha), self.features)
+        shown = mask & (alpha[:, 0] > 0)
+        self.normal = torch.where(
+            shown[:, None], self.normal + clear[:, None] * normal, self.normal
+        )
+        self.sum.add_light(clear[:, None] * color, shown)
+        self.sum.absorb(alpha[:, 0], piece, shown)
+
+    def row_of(self, label: Tensor) -> Tensor:
+        """Returns (r,) int64 table rows of labels."""
+        low, last = self.transfer.domain_2[0], len(self.transfer.opaque_m) - 1
+        return clamp(label - low, 0, last).to(torch.int64)
+
+    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+        """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
+        t, table = piece.middle, self.transfer.table_lm4
+        nearest = self.channel.nearest(holder, probe.beam, t)
+        level = torch.where(piece.odd, 0, piece.level)
+        color, alpha = table[level, self.row_of(nearest.value)].split((3, 1), 1)
+        stretched = stretch(alpha[:, 0], piece.lengths)[:, None]
+        alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
+        normal = torch.zeros_like(color)
+        if self.light.parameters.own_as(LabelNumbers).lit > 0:
+            vector = self.channel.toward_others(holder, nearest) * (
+                holder.scale[:, None] / self.light.cube
+            )
+            normal = unit(torch.where((holder.brick >= 0)[:, None], vector, 0.0))
+            faces_away = dot(normal, self.light.direction) > 0
+            normal = torch.where(faces_away[:, None], -normal, normal)
+            color = self.light.shade(color, normal, t)
+        shown = alpha > 0
+        contribution = torch.cat((color * alpha, alpha, normal * alpha), 1)
+        return torch.where(shown, contribution, 0.0)

@@ -1,146 +1,32 @@
 """The torch twin of `shade_rays`: the fused shaders, right by definition. csrc/shaders/shaders.h
-describes each of them; light.py lights them, march.py walks the rays.
+describes each of them. stored_color.py, channels.py and labels.py hold those that read more of a
+voxel than its value; light.py lights them, march.py walks the rays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import ClassVar
-
 import torch
 from torch import Tensor
 
-from ...base.constants import EMPTY
 from ..arguments import RayArguments, ShadeArguments, TraceArguments
 from ..shading import (
     SHADER_KINDS,
-    FilteredNumbers,
     GradientMagnitudeNumbers,
     IsosurfaceNumbers,
-    LabelNumbers,
-    LightKind,
     ProjectionKind,
     ProjectionNumbers,
     ShadeParameters,
-    StoredColorNumbers,
 )
-from .channels import AllNumbers, ChannelTable
+from .channels import ChannelMix
 from .exact import clamp, dot, larger, sqrt_exact, stretch, unit
-from .labels import LabelBricks
+from .labels import Labels
 from .light import Light, Shadows
-from .march import Piece, Plain, Probe, Walk, a_little_above, a_little_below, mix
+from .lit import Lit
+from .march import Piece, Probe, Walk, a_little_above, a_little_below, mix
 from .rays import INF
-from .tree import ChannelBricks, Holder
+from .stored_color import Filtered, FilteredLit, StoredColor
 
 _BISECTIONS = 4
-PER_SIDE = 10  # numbers of a filtered colour with moments of normals, for each direction
-
-
-@dataclass
-class Lit(Plain):
-    """The lit transfer function, and the base of all fused shaders."""
-
-    light: Light
-    others: tuple[ChannelBricks, ...]  # components of the second channel, or none
-    other_component: int
-    features: Tensor  # (r, c) sums
-    shadows: Shadows | None
-    bricks: ClassVar[type[ChannelBricks]] = ChannelBricks  # how it reads its channel
-
-    def __post_init__(self) -> None:
-        self.normal = torch.zeros_like(self.light.direction)  # (r, 3) sum
-
-    def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
-        """As `Visitor.same`; false for shadows, and for stored normals with a point light."""
-        same = torch.ones_like(fine, dtype=torch.bool)
-        for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
-            numbers = channel.constant_nc
-            same = same & (numbers[fine] == numbers[coarse]).all(1)
-        varies = self.light.parameters.light_kind == LightKind.POINT and bool(self.light.normals)
-        return (same | (fine == coarse)) & (self.shadows is None) & (not varies)
-
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        self.lit(self.rgba(piece, probe), piece, probe, mask)
-
-    def lit(self, rgba: Tensor, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        """Lights an interval and adds it."""
-        t, shown = piece.middle, mask & (rgba[:, 3] > 0)
-        normal = self.light.normal_at(probe, t)
-        is_headlight = self.light.parameters.light_kind == LightKind.HEADLIGHT
-        shadow = None  # no shadows
-        if self.shadows is not None and not is_headlight:
-            shadow = partial(self.light_share, self.shadows, t, shown)
-        color = self.light.shade(rgba[:, :3], normal, t, shadow)
-        color = torch.where(shown[:, None], color, rgba[:, :3])
-        weight = self.sum.clear * rgba[:, 3]
-        self.normal = torch.where(
-            shown[:, None], self.normal + weight[:, None] * normal, self.normal
-        )
-        self.sum.add(torch.cat((color, rgba[:, 3:]), 1), piece, mask)
-
-    def light_share(self, shadows: Shadows, t: Tensor, shown: Tensor, facing: Tensor) -> Tensor:
-        """Returns (r,) the share of light that reaches t (r,), where it is seen and faces it."""
-        shader = replace(self, shadows=None)
-        return shadows.light_share(shader, t, *self.light.towards(t), shown & facing, self.light)
-
-    def done(self, walk: Walk) -> None:
-        """Finishes after the last interval."""
-
-
-class ColorBricks(ChannelBricks):
-    """A channel of red, green, blue, opacity, once or for six directions; ranges are opacity's."""
-
-    def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
-        low, high = self.range_n2c[node, :, 3::4].to(real).unbind(1)
-        return low.amin(1), high.amax(1)
-
-
-class StoredColor(Lit):
-    """Colour and opacity of each voxel."""
-
-    bricks = ColorBricks
-
-    @property
-    def numbers(self) -> StoredColorNumbers:
-        return self.light.parameters.own_as(StoredColorNumbers)
-
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        return ~(a_little_above(high) > 0)
-
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        numbers = self.numbers
-        opacity = self.opacity(piece, probe, self.light.direction)
-        shown = mask & (opacity > 0)
-        components = [
-            self.seen_number(probe, i, piece.middle, self.light.direction) for i in range(3)
-        ]
-        color = torch.stack(components, 1) * numbers.scale
-        divisor = torch.where((numbers.premultiplied > 0) & shown, opacity, 1.0)
-        alpha = stretch(opacity, piece.length / numbers.reference)
-        rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
-        if numbers.lit > 0:
-            self.lit(rgba, piece, probe, shown)
-        else:
-            self.sum.add(rgba, piece, shown)
-
-    def alpha(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
-        return stretch(self.opacity(piece, probe, direction), piece.length / self.numbers.reference)
-
-    def opacity(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
-        """Returns (r,) opacity per reference length."""
-        return clamp(self.seen_number(probe, 3, piece.middle, direction) * self.numbers.scale, 0, 1)
-
-    def seen_number(self, probe: Probe, number: int, t: Tensor, direction: Tensor) -> Tensor:
-        """Returns (r,) one of the four numbers as seen along rays (r, 3), for which three of the
-        directions are mixed where the channel holds six.
-        """
-
-        def read(component: int) -> Tensor:
-            return probe.number(replace(self.channel, component=component), t)
-
-        return _by_direction(direction, self.channel.bricks_bzyxc.shape[4], number, read)
 
 
 class PreIntegrated(Lit):
@@ -320,223 +206,6 @@ class GradientMagnitude(Lit):
         self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, mask)
 
 
-class Labels(Lit):
-    """The label of the nearest voxel."""
-
-    bricks = LabelBricks
-    channel: LabelBricks
-
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        first, last = self.row_of(low), self.row_of(high)
-        before = self.transfer.opaque_m[(first - 1).clamp(min=0)]
-        return self.transfer.opaque_m[last] == torch.where(first > 0, before, 0)
-
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        fine, coarse = probe.nodes.fine, probe.nodes.coarse
-        blended = probe.blend(piece.middle, partial(self.contribution, piece, probe))
-        color, alpha, normal = blended.split((3, 1, 3), 1)
-        hidden = ~(self.contribution(piece, probe, fine)[:, 3] > 0)
-        holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
-        label = self.row_of(self.channel.nearest(holder, probe.beam, piece.middle).value)
-        clear_after, clear, hit_clear = (
-            self.sum.clear * (1 - alpha[:, 0]),
-            self.sum.clear,
-            self.sum.hit_clear,
-        )
-        hit = mask & (clear_after < hit_clear) & (clear >= hit_clear)
-        self.features = torch.where(hit[:, None], (1 + label)[:, None].to(alpha), self.features)
-        shown = mask & (alpha[:, 0] > 0)
-        self.normal = torch.where(
-            shown[:, None], self.normal + clear[:, None] * normal, self.normal
-        )
-        self.sum.add_light(clear[:, None] * color, shown)
-        self.sum.absorb(alpha[:, 0], piece, shown)
-
-    def row_of(self, label: Tensor) -> Tensor:
-        """Returns (r,) int64 table rows of labels."""
-        low, last = self.transfer.domain_2[0], len(self.transfer.opaque_m) - 1
-        return clamp(label - low, 0, last).to(torch.int64)
-
-    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
-        t, table = piece.middle, self.transfer.table_lm4
-        nearest = self.channel.nearest(holder, probe.beam, t)
-        level = torch.where(piece.odd, 0, piece.level)
-        color, alpha = table[level, self.row_of(nearest.value)].split((3, 1), 1)
-        stretched = stretch(alpha[:, 0], piece.lengths)[:, None]
-        alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
-        normal = torch.zeros_like(color)
-        if self.light.parameters.own_as(LabelNumbers).lit > 0:
-            vector = self.channel.toward_others(holder, nearest) * (
-                holder.scale[:, None] / self.light.cube
-            )
-            normal = unit(torch.where((holder.brick >= 0)[:, None], vector, 0.0))
-            faces_away = dot(normal, self.light.direction) > 0
-            normal = torch.where(faces_away[:, None], -normal, normal)
-            color = self.light.shade(color, normal, t)
-        shown = alpha > 0
-        contribution = torch.cat((color * alpha, alpha, normal * alpha), 1)
-        return torch.where(shown, contribution, 0.0)
-
-
-class Filtered(Lit):
-    """The transfer function, and filtered colours where bricks have them (in coarse slots)."""
-
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        fine, coarse = probe.nodes.fine, probe.nodes.coarse
-        has_colors = self.has_colors(fine) | self.has_colors(coarse)
-        self.add_by_function(piece, probe, mask & ~has_colors)
-        if not (mask & has_colors).any():
-            return
-        contribution = probe.blend(
-            piece.middle, lambda holder: self.contribution(piece, probe, holder)
-        )
-        self.add_contribution(contribution, piece, mask & has_colors)
-
-    def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        """Adds an interval where no node has colours."""
-        self.sum.add(self.rgba(piece, probe), piece, mask)
-
-    def add_contribution(self, contribution: Tensor, piece: Piece, mask: Tensor) -> None:
-        """Adds an interval, given the result of `contribution`."""
-        self.sum.add_light(self.sum.clear[:, None] * contribution[:, :3], mask)
-        self.sum.absorb(contribution[:, 3], piece, mask)
-
-    def has_colors(self, holder: Holder) -> Tensor:
-        """Returns (r,) bool: the node's brick has colours."""
-        bricks = self.others[0].bricks_bzyxc if self.others else self.channel.bricks_bzyxc[:0]
-        return (holder.brick >= 0) & (holder.brick < len(bricks))
-
-    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """Returns (r, 4) premultiplied colours and alphas of intervals, from one of the nodes."""
-        row = self.function_row(piece, probe, holder)
-        row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
-        read = self.reader(piece, probe, holder)
-        color, alpha, scale = self.seen_colors(4, read, piece, holder)
-        colors = torch.stack([*(component * scale for component in color[:3]), alpha], 1)
-        colors = torch.where((scale > 0)[:, None], colors, 0.0)
-        return torch.where(self.has_colors(holder)[:, None], colors, row)
-
-    def function_row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """Returns (r, 4) the transfer function's rows for one node's values."""
-        value = self.channel.sample(holder, probe.beam, piece.middle)
-        return self.transfer.interval(value, piece)
-
-    def reader(self, piece: Piece, probe: Probe, holder: Holder) -> Callable[[int], Tensor]:
-        """Returns a function that reads one number (r,) of a node's filtered colours."""
-        brick = torch.where(self.has_colors(holder), holder.brick, EMPTY)
-        colored = replace(holder, brick=brick)
-        return lambda number: self.others[number].sample(colored, probe.beam, piece.middle)
-
-    def seen_colors(
-        self, per_side: int, read: Callable[[int], Tensor], piece: Piece, holder: Holder
-    ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Returns colour and alpha (r,) of a node's voxels as rays see them, `per_side` numbers a
-        direction; alphas (r,) of intervals; and their ratios to the voxels' alphas.
-        """
-        width = len(self.others)
-        color = [_by_direction(self.light.direction, width, i, read, per_side) for i in range(4)]
-        stored_alpha = clamp(color[3], 0, 1)
-        side = self.light.parameters.own_as(FilteredNumbers).side
-        alpha = stretch(stored_alpha, piece.length * holder.scale / side)
-        scale = alpha / torch.where(stored_alpha > 0, stored_alpha, 1.0)
-        return color, alpha, torch.where(stored_alpha > 0, scale, 0.0)
-
-
-class FilteredLit(Filtered):
-    """The lit transfer function, and filtered colours with moments of normals."""
-
-    def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        self.lit(self.rgba(piece, probe), piece, probe, mask)
-
-    def add_contribution(self, contribution: Tensor, piece: Piece, mask: Tensor) -> None:
-        clear, shown = self.sum.clear[:, None], mask & (contribution[:, 3] > 0)
-        normal = self.normal + clear * contribution[:, 4:]
-        self.normal = torch.where(shown[:, None], normal, self.normal)
-        super().add_contribution(contribution, piece, mask)
-
-    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
-        """Returns (r, 7): the result of `Filtered.contribution`, lit, and normals times alpha."""
-        t, light = piece.middle, self.light
-        row = self.function_row(piece, probe, holder)
-        normal = light.to_eye(probe.slope(holder, t, light.cube))
-        color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
-        by_function = torch.cat((color * alpha, alpha, normal * alpha), 1)
-        by_function = torch.where(alpha > 0, by_function, 0.0)
-
-        read = self.reader(piece, probe, holder)
-        color_alpha, interval_alpha, scale = self.seen_colors(PER_SIDE, read, piece, holder)
-        shown, alpha = (scale > 0)[:, None], interval_alpha[:, None]
-        stored_alpha = torch.where(scale > 0, clamp(color_alpha[3], 0, 1), 1.0)[:, None]
-        moments, front = self.moments(read)
-        front = None if front is None else front / stored_alpha
-        base = torch.stack(color_alpha[:3], 1) / stored_alpha
-        color, normal = light.shade_rough(base, moments / stored_alpha, front, t)
-        by_colors = torch.cat((color * alpha, alpha, unit(normal) * alpha), 1)
-        by_colors = torch.where(shown, by_colors, 0.0)
-        return torch.where(self.has_colors(holder)[:, None], by_colors, by_function)
-
-    def moments(self, read: Callable[[int], Tensor]) -> tuple[Tensor, Tensor | None]:
-        """Returns (r, 6) moments of the normals that rays see, and, if six directions are stored,
-        (r, 3) their mean, each normal turned to the side from which its direction sees it.
-        """
-        if len(self.others) == PER_SIDE:
-            return torch.stack([read(i) for i in range(4, PER_SIDE)], 1), None
-        mean = front = torch.zeros_like(self.light.direction[:, :1])
-        for axis, d in enumerate(self.light.direction.unbind(1)):
-            against, first = d < 0, 2 * axis * PER_SIDE
-            m = [
-                torch.where(against, read(first + PER_SIDE + i), read(first + i))
-                for i in range(4, PER_SIDE)
-            ]
-            column = [m[i] for i in ((0, 1, 2), (1, 3, 4), (2, 4, 5))[axis]]
-            weight, total, axial = d * d, m[0] + m[3] + m[5], column[axis]
-            valid = (total > 0) & (axial > 0)
-            scale = (
-                sqrt_exact(torch.where(valid, total, 0.0) / torch.where(valid, axial, 1.0)) * weight
-            )
-            signed_scale = torch.where(against, scale, -scale)[:, None]
-            mean = mean + weight[:, None] * torch.stack(m, 1)
-            front = front + signed_scale * torch.stack(column, 1)
-        return mean, front
-
-
-class ChannelMix(Lit):
-    """Several numbers of a voxel, each with its transfer function."""
-
-    bricks = AllNumbers
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.table = ChannelTable(self.transfer)
-
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        return self.table.transparent(low, high)
-
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        rgba = self.table.interval(piece, probe)
-        self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], mask)
-        self.sum.absorb(rgba[:, 3], piece, mask)
-
-
-def _by_direction(
-    direction: Tensor, width: int, number: int, read: Callable[[int], Tensor], per_side: int = 4
-) -> Tensor:
-    """Returns (r,) one of the numbers of a voxel as seen along rays (r, 3); `read` reads one. Where
-    a channel holds six times `per_side` numbers, three of the directions are mixed.
-    """
-    if width == per_side:
-        return read(number)
-    side = [
-        torch.where(
-            d < 0, read((2 * axis + 1) * per_side + number), read(2 * axis * per_side + number)
-        )
-        for axis, d in enumerate(direction.unbind(1))
-    ]
-    x, y, _ = (direction * direction).unbind(1)
-    return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
-
-
 #: Twins by the names of the C++ structs.
 TWINS: dict[str, type[Lit]] = {
     "Lit": Lit,
@@ -559,7 +228,7 @@ def shade_rays(
     rays: RayArguments, arguments: TraceArguments, shading: ShadeArguments, parameter_54: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `ops.shade_rays`."""
-    kind = SHADER_KINDS[shading.shader]
+    kind, facts = [*SHADER_KINDS.items()][shading.shader]
     twin = TWINS[kind]
     walk = Walk.enter(rays, arguments, twin.bricks)
     beam, channel = walk.intervals.beam, walk.channel
@@ -574,7 +243,7 @@ def shade_rays(
     features = beam.first.new_zeros((len(beam.first), shading.features))
     shader = twin.begin(
         *(rays, arguments, walk, light, others, shading.other_component, features),
-        shadows if kind.startswith("Shadowed") else None,
+        shadows if facts.shadows else None,
     )
     walk.go(shader)
     shader.done(walk)
