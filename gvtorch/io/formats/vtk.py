@@ -123,6 +123,11 @@ def open_vtk(path: str, key: str | None = None) -> VolumeSource:
     return _open_legacy(path, key) if path.lower().endswith(".vtk") else _open_xml(path, key)
 
 
+def _extent(points: Sequence[int], cells: bool) -> list[int]:
+    """Returns the values along x, y and z: at points, or in the cells between them."""
+    return [max(n - 1, 1) if cells else n for n in points]
+
+
 def _source_fields(
     path: str,
     points: Sequence[int],
@@ -131,7 +136,7 @@ def _source_fields(
     dropped: tuple[str, ...],
 ) -> dict[str, Any]:
     """Returns the fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
-    size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
+    size = _extent(points, array["cells"])
     check_extent(path, size, max_values=_MAX_VALUES)
     if array["cells"]:
         affine = affine.copy()
@@ -351,7 +356,7 @@ def _legacy_parts(
             affine[:3, 3] = [float(n) for n in tokens[1:4]]
         elif name in ("POINT_DATA", "CELL_DATA"):
             cells = name == "CELL_DATA"
-            count = math.prod(max(n - 1, 1) if cells else n for n in points)
+            count = math.prod(_extent(points, cells))
             if int(tokens[1]) != count:
                 raise ValueError(f"{path}: {' '.join(tokens)[:80]!r} of a grid that has {count}")
         elif name == "FIELD":
@@ -387,8 +392,7 @@ def _legacy_array(
     if not dtype:
         raise ValueError(f"{path}: {' '.join(tokens)[:80]!r} is not an array of numbers")
     check_extent(path, (*points, width), max_values=_MAX_VALUES)
-    count = math.prod(max(n - 1, 1) if cells else n for n in points) * width
-    size = np.dtype(dtype).itemsize
+    nbytes = math.prod(_extent(points, cells)) * width * np.dtype(dtype).itemsize
     return {
         "name": unquote(name),
         "first": kind in ("SCALARS", "COLOR_SCALARS"),
@@ -396,5 +400,5 @@ def _legacy_array(
         "width": width,
         "stored": ">" + dtype,
         "cells": cells,
-        "bytes": count * size,
+        "bytes": nbytes,
     }
