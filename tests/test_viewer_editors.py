@@ -32,8 +32,8 @@ def sliced(page: Page, **slices) -> tuple[dict, np.ndarray]:
 
     def come() -> bool:
         head = page.pictures[-1][0] if page.pictures else {}
-        layout, index = head.get("layout"), slices.get("at")
-        return bool(layout) and head["final"] and (index is None or layout["x"]["at"] == index)
+        layout, position = head.get("layout"), slices.get("position")
+        return bool(layout) and head["final"] and position in (None, layout["x"]["position"])
 
     page.until(come)
     return page.final()
@@ -124,7 +124,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
         return real(self, axis, state, pixel)
 
     monkeypatch.setattr(Planes, "_render_plane", slow)
-    page.send("change", state={"slices": {"at": [10.0, 10.0, 20.0]}})
+    page.send("change", state={"slices": {"position": [10.0, 10.0, 20.0]}})
     camera = turned_camera(page.camera, 0.5)
     page.send("move", camera=camera, moving=False)
     page.until(lambda: page.pictures[-1][0]["camera"]["eye"] == camera["eye"])
@@ -132,7 +132,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     assert not page.pictures[-1][0]["final"], "a plane is still on its way"
     go.set()
     page.final()
-    page.send("change", state={"slices": {"at": [10.0, 10.0, 30.0]}})
+    page.send("change", state={"slices": {"position": [10.0, 10.0, 30.0]}})
     text = page.next("error", 0)["text"]
     assert text == "a slice can't be read: chunk 3 is gone"
     page.final()
@@ -206,7 +206,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         session_.close()
     page = Page(session)
     for wrong, message in (
-        ({"at": [1, 2]}, "3 items"),
+        ({"position": [1, 2]}, "3 items"),
         ({"window": [3, 3]}, "a low and a high"),
         ({"colors": "red"}, "'gray' or 'shader'"),
     ):
