@@ -42,7 +42,7 @@ def main(settings: Settings) -> None:
     for name in IMAGES:
         image = getattr(cost, name).float()
         valid = image[~image.isnan()]
-        print(f"{name:8s} mean {float(valid.mean()):7.2f}  most {float(valid.max()):7.2f}")
+        print(f"{name:8s} mean {float(valid.mean()):7.2f}  max {float(valid.max()):7.2f}")
     panels = [picture.color.cpu(), *(cost.picture(name).color for name in IMAGES)]
     rows = [torch.cat(panels[first : first + 3], 1) for first in (0, 3)]
     dataclasses.replace(picture, color=torch.cat(rows, 0)).save(settings.output)

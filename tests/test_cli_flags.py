@@ -226,7 +226,7 @@ def test_help_offers_what_a_command_takes(scan_store, monkeypatch):
 def test_values_may_begin_with_a_minus(small, tmp_path):
     run = gvtorch("info", small, "--spacing", "-1,1,1")
     assert run.returncode == 2 and "spacing must be positive" in run.stderr
-    for flags in (("--at", "-0.5mm"), ("--up", "-y"), ("--up", "+y")):
+    for flags in (("--position", "-0.5mm"), ("--up", "-y"), ("--up", "+y")):
         run = gvtorch("slice", small, "-o", tmp_path / "a.png", *flags)
         assert run.returncode == 0, run.stderr
 

@@ -1,6 +1,11 @@
-"""Every link of the docs leads to an existing file and heading."""
+"""Every link of the docs leads to an existing file and heading, and every name in backticks, there
+and in docstrings and comments, exists in the code.
+"""
 
+import ast
 import re
+import subprocess
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -9,10 +14,14 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
+def prose(page: str) -> str:
+    """Returns a page without its blocks of code."""
+    return re.sub(r"^```.*?^```", "", page, flags=re.M | re.S)
+
+
 def anchors(text: str) -> set[str]:
     """Returns the anchors that GitHub makes of a page's headings."""
-    prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
-    headings = re.findall(r"^#+ (.*)$", prose, flags=re.M)
+    headings = re.findall(r"^#+ (.*)$", prose(text), flags=re.M)
     return {re.sub(r"[^\w\- ]", "", h.strip().lower()).replace(" ", "-") for h in headings}
 
 
@@ -41,3 +50,105 @@ def test_a_link_that_leads_nowhere_is_found(tmp_path):
     page.write_text("# One `two`, three\n```\n# no heading\n```\n")
     links = "[a](#one-two-three) [b](gone.md) [c](page.md#no-heading) [d](https://example.org/#x)"
     assert broken(page, links) == ["gone.md", "page.md#no-heading"]
+
+
+# --- names in backticks
+
+WORD = re.compile(r"(?<!\w)[A-Za-z_]\w+")
+#: Words in backticks that are no names of this project.
+FOREIGN = {
+    # names of other projects, programs and standards
+    *("GvShader", "GvSimpleHostProducer", "ShadeOn", "ray_marching", "render_weight_from_density"),
+    *("vtkGPUVolumeRayCastMapper", "vtkSmartVolumeMapper", "add_image", "tofile", "forkserver"),
+    *("ccache", "nccopy", "commit", "glfw", "get_proc_address", "gl_FragDepth", "glReadPixels"),
+    *("glClipControl", "glDepthFunc", "Bone"),
+    # what a reader replaces by a name, a number or a file
+    *("COLUMN", "VOLUME", "RRGGBB", "_XxYxZ_dtype", "ex", "ey", "ez", "tx", "ty"),
+    *("open_NAME", "entry_NAME", "_take_NAME", "test_formats_"),
+    *("smoke", "hyg_stars", "scan_512x512x300_int16"),
+}
+#: Endings of files of code that is not Python.
+CODE = (".h", ".cpp", ".cu", ".js", ".css", ".html", ".toml")
+#: Pages on the past, whose names may be gone.
+HISTORY = ("CHANGELOG.md", "changes.md")
+
+
+@cache
+def tracked() -> list[Path]:
+    """Returns the files of the repository."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    return [path for name in run.stdout.splitlines() if (path := ROOT / name).is_file()]
+
+
+def docstrings(tree: ast.AST) -> list[ast.Constant]:
+    """Returns the strings that are statements: docstrings, and texts below fields."""
+    values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
+    return [v for v in values if isinstance(v, ast.Constant) and isinstance(v.value, str)]
+
+
+def names_in_python(text: str) -> set[str]:
+    """Returns identifiers, and the words of strings without a space, which may be names."""
+    tree, names = ast.parse(text), set()
+    documentation = {id(node) for node in docstrings(tree)}
+    for node in ast.walk(tree):
+        for field in ("id", "attr", "name", "arg", "asname", "module"):
+            value = getattr(node, field, None)
+            names |= set(value.split(".")) if isinstance(value, str) else set()
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            is_name = " " not in node.value and id(node) not in documentation
+            names |= set(WORD.findall(node.value)) if is_name else set()
+    return names
+
+
+@cache
+def names_in_code() -> set[str]:
+    """Returns all names in the code, and those of files and folders."""
+    names = set(FOREIGN)
+    for path in tracked():
+        names |= {*path.relative_to(ROOT).parts, path.stem}
+        if path == Path(__file__):
+            continue
+        if path.suffix in (".py", ".pyi"):
+            names |= names_in_python(path.read_text(encoding="utf-8"))
+        elif path.suffix in CODE or path.name in ("Makefile", "run"):
+            code = re.sub(r"//.*|^#.*", "", path.read_text(encoding="utf-8"), flags=re.M)
+            names |= set(WORD.findall(code))
+    return names
+
+
+def documentation(path: Path) -> str:
+    """Returns the prose of a page, or the docstrings and comments of a module."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".md":
+        return prose(text)
+    comments = re.findall(r"#.*", text)
+    return "\n\n".join([node.value for node in docstrings(ast.parse(text))] + comments)
+
+
+def unknown(text: str) -> list[str]:
+    """Returns the words in backticks that are no names, and the paths that lead to no file."""
+    spans = re.findall(r"`([^`]+)`", text)
+    words = [word for span in spans for word in WORD.findall(span)]
+    paths = [p for span in spans for p in re.findall(r"[\w./]+/[\w.]+\.(?:py|h|cpp|js|md)\b", span)]
+    files = [f"/{path.relative_to(ROOT)}" for path in tracked()]
+    return [word for word in words if word not in names_in_code()] + [
+        path
+        for path in paths
+        if "NAME" not in path and not any(f.endswith(f"/{path}") for f in files)
+    ]
+
+
+def test_names_in_backticks_exist():
+    files = [path for path in tracked() if path.suffix in (".py", ".md")]
+    found = {
+        str(path.relative_to(ROOT)): words
+        for path in files
+        if path.name not in HISTORY and (words := unknown(documentation(path)))
+    }
+    assert len(files) > 500 and not found
+
+
+def test_a_name_that_does_not_exist_is_found():
+    text = "`Engine.frame` in `engine/engine.py`, `Engine.renderr` in `engine/engin.py` and `a + b`"
+    assert unknown(text) == ["renderr", "engin", "engine/engin.py"]

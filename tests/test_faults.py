@@ -25,6 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import gvtorch as gv
 from gvtorch.io.source import VolumeSource
 from gvtorch.io.stores import conversion, shard
+from gvtorch.io.stores.block_reader import BlockReader
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.level_reader import StoredArray
 from gvtorch.io.stores.store import Store
@@ -171,7 +172,7 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
     resident = gv.render(gv.N3Tree.from_volume(gv.Volume(data)), VIEW, transfer)
     assert resident.alpha.max() > 0
     store = convert(gv.Volume(data), tmp_path / "a.zarr", workers=1)
-    calls = {"read": [*READS, (Store, "_read_chunks"), (Store, "_read_cells")]}.get(kind)
+    calls = {"read": [*READS, (BlockReader, "_read_chunks"), (BlockReader, "read_cells")]}.get(kind)
     failed = 0
     for number in (*range(0, 14, 2), 20, 30):
         producer = gv.StoredProducer(Store.open(store.location), workers=1)

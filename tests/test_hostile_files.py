@@ -109,6 +109,15 @@ def test_nrrd_data_behind_lines_and_bytes(tmp_path, encoding, lines):
     assert np.array_equal(gv.read_volume(tmp_path / "a.nrrd").data[..., 0].numpy(), data)
 
 
+def test_nrrd_data_at_the_end_whatever_lines_come_before(tmp_path):
+    data = np.arange(24, dtype="u1").reshape(2, 3, 4)
+    Path(tmp_path / "a.nrrd").write_bytes(
+        b"NRRD0004\ntype: uchar\ndimension: 3\nsizes: 4 3 2\nencoding: raw\nline skip: 1\n"
+        b"byte skip: -1\n\na line\nabc" + data.tobytes()
+    )
+    assert np.array_equal(gv.read_volume(tmp_path / "a.nrrd").data[..., 0].numpy(), data)
+
+
 @pytest.mark.parametrize("kind", ["mesh", "points"])
 def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypatch, kind):
     if kind == "mesh":

@@ -96,12 +96,12 @@ def test_colours_and_components():
     ("options", "message"),
     [
         ({"axis": "w"}, "axis must be 'x', 'y', 'z' or 'all'"),
-        ({"at": 1.5}, "at must be finite and >= 0 and <= 1"),
-        ({"at": 14}, "at along z must be an int >= 0 and <= 13"),
-        ({"at": "here"}, "at must be a share such as 50%"),
-        ({"at": "99mm"}, "at 99mm lies beyond the data, z is -5 to 23 millimeter"),
-        ({"at": ("1", "2", "3")}, "at must be one place"),
-        ({"axis": "all", "at": (0.5, 0.5)}, "at must be one place or three, for x, y and z"),
+        ({"position": 1.5}, "position must be finite and >= 0 and <= 1"),
+        ({"position": 14}, "position along z must be an int >= 0 and <= 13"),
+        ({"position": "here"}, "position must be a share such as 50%"),
+        ({"position": "99mm"}, "99mm lies beyond the data, z is -5 to 23 millimeter"),
+        ({"position": ("1", "2", "3")}, "position must be one for"),
+        ({"axis": "all", "position": (0.5, 0.5)}, "position must be one or three, for x, y and z"),
         ({"up": "+z"}, r"up must be \+y, -y, \+x or -x across z"),
         ({"axis": "all", "up": "+z"}, "up is for one plane"),
         ({"level": 1}, "level is for stores"),
@@ -123,13 +123,13 @@ def test_the_command(volume, store, tmp_path):
     for path, flags in ((file, ("--spacing", "1,1,2")), (store.location, ())):
         out = tmp_path / "s.png"
         run = gvtorch(
-            "slice", path, *flags, "--axis", "y", "--at", "3", "--window", "0,255", "-o", out
+            "slice", path, *flags, "--axis", "y", "--position", "3", "--window", "0,255", "-o", out
         )
         assert run.returncode == 0, run.stderr
         assert "10x28" in run.stdout
         actual = gv.pictures.read_files._read_png(out)[..., 0]
         assert np.array_equal(actual, volume.data.numpy()[::-1, 3, :, 0].repeat(2, 0))
-        run = gvtorch("slice", path, *flags, "--axis", "all", "--at", "1,50%,2", "-o", out)
+        run = gvtorch("slice", path, *flags, "--axis", "all", "--position", "1,50%,2", "-o", out)
         assert run.returncode == 0, run.stderr
         viridis = gvtorch("slice", path, *flags, "--tf", "viridis", "-o", tmp_path / "v.png")
         assert viridis.returncode == 0, viridis.stderr
@@ -140,8 +140,8 @@ def test_the_command(volume, store, tmp_path):
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--at", "1,2"], "--at must be one place, or three"),
-        (["--axis", "all", "--at", "1,2"], "--at must be one place, or three"),
+        (["--position", "1,2"], "--position must be one, or three"),
+        (["--axis", "all", "--position", "1,2"], "--position must be one, or three"),
         (["--level", "1"], "--level is for stores; make one"),
         (["--image", "a"], "--image is for stores"),
         (["--window", "3,2"], "--window must be LO,HI with LO < HI"),

@@ -32,8 +32,8 @@ def sliced(page: Page, **slices) -> tuple[dict, np.ndarray]:
 
     def come() -> bool:
         head = page.pictures[-1][0] if page.pictures else {}
-        layout, index = head.get("layout"), slices.get("at")
-        return bool(layout) and head["final"] and (index is None or layout["x"]["at"] == index)
+        layout, position = head.get("layout"), slices.get("position")
+        return bool(layout) and head["final"] and position in (None, layout["x"]["position"])
 
     page.until(come)
     return page.final()
@@ -48,7 +48,7 @@ def test_slices_are_those_of_slice_picture_beside_the_picture(session):
     """Every plane to the last bit, before JPEG; the 3D picture equals one of its part's size."""
     page, volume = Page(session, 404, 304), bright_ball()
     page.final()
-    head, seen = sliced(page, at=[25.2, 19.0, 14.9])
+    head, seen = sliced(page, position=[25.2, 19.0, 14.9])
     layout = head["layout"]
     page.send("still", width=404, height=304)
     page.until(lambda: page.files)
@@ -59,7 +59,7 @@ def test_slices_are_those_of_slice_picture_beside_the_picture(session):
         expected = gv.slice_picture(volume, axis, index, span=span, scale=scale).to_srgb8().numpy()
         assert np.array_equal(cut_out(still, layout[axis]["image"]), expected), axis
     page.files.clear()
-    sliced(page, at=[25.0, 19.0, 15.0], colors="shader")
+    sliced(page, position=[25.0, 19.0, 15.0], colors="shader")
     page.send("still", width=404, height=304)
     page.until(lambda: page.files)
     actual = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
@@ -79,7 +79,7 @@ def test_edges_of_a_plane_are_where_the_page_is_told(session):
     page = Page(session, 804, 604)
     page.final()
     middle = [0.65 * 40 - 0.5, 0.5 * 40 - 0.5, 0.4 * 40 - 0.5]
-    layout = sliced(page, at=middle)[0]["layout"]
+    layout = sliced(page, position=middle)[0]["layout"]
     seen = pixels(page.pictures[-1][1]).astype(int).sum(-1)
     for axis in "xyz":
         plane = layout[axis]
@@ -96,13 +96,13 @@ def test_edges_of_a_plane_are_where_the_page_is_told(session):
 def test_a_plane_that_moves_leaves_the_picture_as_it_is(session, monkeypatch):
     page = Page(session, 204, 154)
     page.final()
-    sliced(page, at=[10.0, 10.0, 10.0])
+    sliced(page, position=[10.0, 10.0, 10.0])
     frames = []
     real = session.scene.frame
     monkeypatch.setattr(session.scene, "frame", lambda *a, **k: frames.append(1) or real(*a, **k))
     before, count = page.final()[1], len(page.pictures)
     for z in (11.0, 12.0, 13.0):
-        head, seen = sliced(page, at=[10.0, 10.0, z])
+        head, seen = sliced(page, position=[10.0, 10.0, z])
     assert not frames and head["samples"] == 16 and len(page.pictures) > count
     left, top, width, height = head["layout"]["view"]
     inner = [left + 8, top + 8, width - 8, height - 8]  # JPEG's blocks reach across parts
@@ -114,17 +114,17 @@ def test_a_plane_that_moves_leaves_the_picture_as_it_is(session, monkeypatch):
 def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypatch):
     page = Page(session, 204, 154)
     page.final()
-    sliced(page, at=[10.0, 10.0, 10.0])
+    sliced(page, position=[10.0, 10.0, 10.0])
     go, real = threading.Event(), Planes._render_plane
 
     def slow(self, axis, state, pixel):
         assert go.wait(TIMEOUT)
-        if state.slices.at[2] == 30:
+        if state.slices.position[2] == 30:
             raise OSError("chunk 3\nis gone")
         return real(self, axis, state, pixel)
 
     monkeypatch.setattr(Planes, "_render_plane", slow)
-    page.send("change", state={"slices": {"at": [10.0, 10.0, 20.0]}})
+    page.send("change", state={"slices": {"position": [10.0, 10.0, 20.0]}})
     camera = turned_camera(page.camera, 0.5)
     page.send("move", camera=camera, moving=False)
     page.until(lambda: page.pictures[-1][0]["camera"]["eye"] == camera["eye"])
@@ -132,7 +132,7 @@ def test_a_plane_that_takes_long_or_fails_holds_up_no_picture(session, monkeypat
     assert not page.pictures[-1][0]["final"], "a plane is still on its way"
     go.set()
     page.final()
-    page.send("change", state={"slices": {"at": [10.0, 10.0, 30.0]}})
+    page.send("change", state={"slices": {"position": [10.0, 10.0, 30.0]}})
     text = page.next("error", 0)["text"]
     assert text == "a slice can't be read: chunk 3 is gone"
     page.final()
@@ -178,7 +178,7 @@ def test_slices_of_labels_have_their_colours():
         page.final()
         labels = page.of_type("welcome")[0]["labels"]
         assert labels["names"] == sorted(set(data.ravel().tolist())) and labels["count"] == 9
-        layout = sliced(page, at=[7.0, 6.0, 5.0])[0]["layout"]
+        layout = sliced(page, position=[7.0, 6.0, 5.0])[0]["layout"]
         page.send("still", width=204, height=154)
         page.until(lambda: page.files)
         actual = cut_out(pixels(page.files["picture.png"]), layout["z"]["image"])
@@ -206,7 +206,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         session_.close()
     page = Page(session)
     for wrong, message in (
-        ({"at": [1, 2]}, "3 items"),
+        ({"position": [1, 2]}, "3 items"),
         ({"window": [3, 3]}, "a low and a high"),
         ({"colors": "red"}, "'gray' or 'shader'"),
     ):
@@ -226,7 +226,7 @@ def test_render_makes_the_picture_of_a_state_with_slices_and_cost(tmp_path):
         "develop": Development(samples=2, exposure=0.5),
     }
     for name, more in (
-        ("slices", {"slices": Slices(at=(20, 22, 15), window=(10, 200))}),
+        ("slices", {"slices": Slices(position=(20, 22, 15), window=(10, 200))}),
         ("coloured", {"slices": Slices(colors="shader")}),
         ("blend", {"show": "samples", "blend": 0.4}),
         ("both", {"show": "nodes", "blend": 0.5, "slices": Slices()}),

@@ -41,33 +41,33 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
     alone = tab.final()
     before = with_slices(tab)
     assert differs(before, alone) > 60
-    position = viewer.session.ask(lambda: viewer.state.slices.at)
+    position = viewer.session.ask(lambda: viewer.state.slices.position)
     assert np.allclose(position, 19.5)
     tab.page.mouse.click(*middle(tab, "z", 0.65, 0.25))  # x to the right, y down
-    tab.until(lambda: viewer.state.slices.at != position)
+    tab.until(lambda: viewer.state.slices.position != position)
     tab.final()
-    x, y, z = viewer.session.ask(lambda: viewer.state.slices.at)
+    x, y, z = viewer.session.ask(lambda: viewer.state.slices.position)
     assert abs(x - 25.5) < 0.5 and abs(y - 9.5) < 0.5 and z == 19.5
     tab.page.mouse.move(*middle(tab, "z"))
     for _ in range(4):
         tab.page.mouse.wheel(0, 100)
         tab.page.wait_for_timeout(30)
-    tab.until(lambda: viewer.state.slices.at[2] == 15.5)
+    tab.until(lambda: viewer.state.slices.position[2] == 15.5)
     tab.until("!app.stateBefore")
     scrolled = tab.final()
     left, top, width, height = tab.app("app.slices.layout.z.image")
     part = np.s_[top : top + height, left : left + width]
     assert differs(scrolled[part], before[part]) > 30
     tab.drag(middle(tab, "x", 0.2, 0.2), middle(tab, "x", 0.8, 0.4))  # y to the right, z up
-    tab.until(lambda: abs(viewer.state.slices.at[1] - 31.5) < 0.6)
-    assert abs(viewer.state.slices.at[2] - 23.5) < 0.6
+    tab.until(lambda: abs(viewer.state.slices.position[1] - 31.5) < 0.6)
+    assert abs(viewer.state.slices.position[2] - 23.5) < 0.6
     camera, steps = tab.app("app.camera.eye"), tab.app("app.history.done.length")
     assert 4 <= steps <= 7  # on a busy machine the wheel pauses in between
     for _ in range(steps - 1):  # all except that slices are shown
         tab.page.get_by_label("Undo").click()
-    tab.until("app.state.slices.at.every((one) => one === 19.5)")
+    tab.until("app.state.slices.position.every((one) => one === 19.5)")
     tab.page.get_by_label("Redo").click()
-    tab.until(lambda: abs(viewer.state.slices.at[0] - 25.5) < 0.5)
+    tab.until(lambda: abs(viewer.state.slices.position[0] - 25.5) < 0.5)
     # The picture in its part of the canvas can be turned as before; the planes stay.
     area = tab.app("app.view.pictureArea")
     box = tab.page.locator(".gv-stage").bounding_box()

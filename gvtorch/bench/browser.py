@@ -104,7 +104,7 @@ class Page:
         self.page.add_init_script(script.replace("SELECTOR", repr(selector)))
         self.page.goto(url)
         self._fit_window(selector)
-        self._record(True)
+        self._start_log()
         self._wait_for_rest()
 
     def _fit_window(self, selector: str) -> None:
@@ -128,8 +128,9 @@ class Page:
         self.page.wait_for_timeout(300)  # until its layout is final
         return self.page.evaluate(script) or box
 
-    def _record(self, on: bool) -> None:
-        self.page.evaluate("on => { gvProbe.on = on; gvProbe.log = gvProbe.log.slice(-1); }", on)
+    def _start_log(self) -> None:
+        """Logs pictures from now on; of those before, the last one is kept."""
+        self.page.evaluate("() => { gvProbe.on = true; gvProbe.log = gvProbe.log.slice(-1); }")
 
     def _wait_for_rest(self, moved_at: float = 0.0) -> None:
         """Waits until the picture changes after `moved_at` (ms), then not for `rest_seconds`."""
@@ -146,13 +147,13 @@ class Page:
         (x, y), mouse = self.center, self.page.mouse
         mouse.move(x, y)
         mouse.down()
-        self._record(True)
+        self._start_log()
         self._swing(seconds)
         rate = (self.page.evaluate("gvProbe.log.length") - 1) / seconds
         self.rest_seconds = min(_REST_SECONDS, 0.6 + 4 / max(rate, 1.0))
         delays = []
         for _ in range(jumps):
-            self._record(True)
+            self._start_log()
             self._swing(0.4)
             delays.append(self._jump(x + 0.15 * self.size[0], y))
         mouse.up()

@@ -278,7 +278,7 @@ def stream(record: Record) -> None:
         if not record.wants(case):
             continue
         settings.tell(f"stream: {memory}")
-        plain_copy = _clock_copy(record, pinned)
+        copy_timing, copy_rate, copy_bytes = _clock_copy(record, pinned)
         cold_starts: list[list[tuple[float, int]]] = []
         began = time.perf_counter()
         for _ in range(settings.repeats + 1):
@@ -297,11 +297,11 @@ def stream(record: Record) -> None:
                 timing: Timing = summarize([run[0] for run in measured])
                 rate = 1e3 * moved_bytes / timing.median
                 figures = {"moved_bytes": moved_bytes, "bytes_per_second": rate}
-                record.add(case, who, timing, **figures, copy_share=rate / plain_copy[1])
+                record.add(case, who, timing, **figures, copy_share=rate / copy_rate)
         record.add(
-            *(case, f"one {memory} copy", plain_copy[0]),
-            moved_bytes=plain_copy[2],
-            bytes_per_second=plain_copy[1],
+            *(case, f"one {memory} copy", copy_timing),
+            moved_bytes=copy_bytes,
+            bytes_per_second=copy_rate,
         )
     record.note(
         "ms: the stages produce and write, over the frames of a monitored cold start that moved "
@@ -323,6 +323,7 @@ def _load_options(side: int) -> dict[str, Any]:
 
 
 def _clock_copy(record: Record, pinned: bool) -> tuple[Timing, float, int]:
+    """Returns the time, the bytes per second, and the bytes of one copy from the host."""
     settings = record.settings
     size = 1 << (20 if settings.quick else 28)
     source = torch.ones(size, dtype=torch.uint8)

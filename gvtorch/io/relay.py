@@ -202,6 +202,7 @@ class _Server(http.server.ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.secret = secrets.token_urlsafe(16)
+        # By number, which is part of the address; kept, because arrays that are open use it.
         self.folders: list[Relayed] = []
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
@@ -255,7 +256,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.send_response(status)
         self.send_header("Content-Length", str(len(content)))
         if byte_range is not None and status == 206:
-            begin = byte_range.start if byte_range.start >= 0 else 0
+            # The file's size is unknown here, and with it the position of its last bytes; for these
+            # this says 0, which tensorstore, the only client, accepts.
+            begin = max(byte_range.start, 0)
             self.send_header("Content-Range", f"bytes {begin}-{begin + len(content) - 1}/*")
         self.end_headers()
         self.wfile.write(content)

@@ -102,8 +102,8 @@ class Mesh:
         with np.errstate(over="ignore"):
             size = max(float((self.bounds[1] - self.bounds[0]).max()), float(abs(used).max()))
         if not _MIN_SIZE <= size <= 1 / _MIN_SIZE:
-            limits = f"{_MIN_SIZE:g} to {1 / _MIN_SIZE:g} can be told"
-            raise ValueError(f"{self.name}: spans {size:.3g} world units; {limits}")
+            limits = f"{_MIN_SIZE:g} to {1 / _MIN_SIZE:g}"
+            raise ValueError(f"{self.name}: size must be {limits} world units, got {size:.3g}")
 
     @property
     def bounds(self) -> np.ndarray:

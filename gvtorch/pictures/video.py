@@ -14,7 +14,7 @@ from ..base.messages import need_library
 from ..base.whole_file import whole_file
 from .picture import Picture
 
-FILMS = [".mp4", ".gif", ".webp"]
+FILM_SUFFIXES = [".mp4", ".gif", ".webp"]
 _MAX_GIF_FPS = 50  # pictures a second; viewers play faster ones slowly
 _PALETTE_FRAMES = 16  # pictures from which the colours of a GIF are taken
 
@@ -42,8 +42,9 @@ class Video:
         """
         self._path, self._size = Path(path), (width, height)
         suffix = self._path.suffix
-        if suffix not in FILMS:
-            raise ValueError(f"Video: path must end in {', '.join(FILMS)}, got {str(path)!r}")
+        if suffix not in FILM_SUFFIXES:
+            suffixes = ", ".join(FILM_SUFFIXES)
+            raise ValueError(f"Video: path must end in {suffixes}, got {str(path)!r}")
         if not self._path.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self._path.parent}")
         check.integer("Video", "fps", fps, low=1, high=_MAX_GIF_FPS if suffix == ".gif" else 1000)

@@ -31,7 +31,7 @@ from ..io.stores.ngff import is_zarr
 from .bench import Bench
 from .common import Bar, ReadOptions, Switch, given_flags, option, refuse_file_flags, volume_formats
 from .fly import Fly
-from .making import Making, Splat, Voxelize, store_summary
+from .making import ConversionFlags, Splat, Voxelize, store_summary
 from .render import Render
 from .slice import Slice
 from .surface import Surface
@@ -102,26 +102,26 @@ class Convert:
     # print the estimated disk space, memory and time, and write nothing
     dry_run: Switch = False
 
-    making: tyro.conf.OmitArgPrefixes[Making] = Making()
+    conversion: tyro.conf.OmitArgPrefixes[ConversionFlags] = ConversionFlags()
     source: tyro.conf.OmitArgPrefixes[ReadOptions] = ReadOptions()
 
     def run(self) -> None:
         from ..io.stores.conversion import convert, estimate
 
-        self.making.check()
+        self.conversion.check()
         arguments: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
         if self.dry_run:
             from ..base import check
             from ..io.stores.unfinished import is_begun
 
-            is_begun(self.store, resume=self.making.resume)  # raises as `convert` would
+            is_begun(self.store, resume=self.conversion.resume)  # raises as `convert` would
             if self.memory is not None:
                 check.nbytes("convert", "--memory", self.memory)
-            arguments |= {"block": self.making.block, "workers": self.making.workers}
+            arguments |= {"block": self.conversion.block, "workers": self.conversion.workers}
             _print_table(_readable(estimate(self.path, self.store, **arguments).as_dict()))
             return
         start, was_finished = time.perf_counter(), (self.store / "zarr.json").exists()
-        with self.making.arguments(speed=True) as store_options:
+        with self.conversion.arguments(speed=True) as store_options:
             store = convert(self.path, self.store, **arguments, memory=self.memory, **store_options)
         if was_finished:  # --resume had nothing to do
             print(f"{printable(self.store)}: is finished already")
@@ -264,8 +264,8 @@ def _unbox_error(error_text: str) -> str:
 
 
 def _join_minus_values(args: list[str]) -> list[str]:
-    """Joins values that begin with a minus to their flags, as in `--up=-z` and `--at=-4mm`, because
-    the parser would take them for flags.
+    """Joins values that begin with a minus to their flags, as in `--up=-z` and `--position=-4mm`,
+    because the parser would take them for flags.
     """
     joined: list[str] = []
     for arg in args:

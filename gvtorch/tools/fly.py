@@ -20,8 +20,8 @@ from ..base.digits import whole_number
 from ..base.messages import one_line, printable
 from ..base.whole_file import write_text
 from ..io.stores.ngff import is_zarr
+from .annotations import Annotations
 from .common import Bar, check_outputs, given_flags, option, parse_size, volume_formats
-from .drawn import Drawn
 from .look import default_orbit, parse_camera, parse_orbit, up_and_front
 from .scene import RenderedScene, SceneFlags
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..viewer.flight import Flight, KeyFile
     from ..viewer.state import ViewState
 
-_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILMS"))
+_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILM_SUFFIXES"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ class Fly:
     trace: Annotated[Path | None, option(metavar="FILE.json")] = None
 
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
-    drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
+    annotation: tyro.conf.OmitArgPrefixes[Annotations] = Annotations()
 
     def run(self) -> None:
         from ..base.stage import Trace, stage
@@ -168,7 +168,8 @@ class Fly:
 
             def render_at(position: float) -> tuple[ViewState, Camera, Picture]:
                 camera = path.camera(position, width, height, look.camera_model)
-                eye = Eye.of(camera, scene.box) if given_flags(self.drawn) else base_state.camera
+                annotated = given_flags(self.annotation)
+                eye = Eye.of(camera, scene.box) if annotated else base_state.camera
                 return replace(base_state, camera=eye), camera, scene.render(camera)
         else:
             flight = self._flight_from(base_state)
@@ -183,7 +184,7 @@ class Fly:
             state, camera, picture = render_at(position)
             assert state.camera is not None
             overlay_arguments = (state.shader, scene.info, state.component, camera, state.camera)
-            overlay = self.drawn.overlay(*overlay_arguments)
+            overlay = self.annotation.overlay(*overlay_arguments)
             return camera, picture if overlay is None else overlay.over(picture)
 
         return take_picture
@@ -244,7 +245,7 @@ class Fly:
             raise ValueError(f"{self._state_flag} sets what --time sets: leave one out")
         steps = max(1, frames - 1 + flight.closed)
         times = [round(flight.along(n / steps).time) for n in range(frames)]
-        count = self._time_count()
+        count = self._time_count
         if not 0 <= min(times) <= max(times) < count:
             time = next(t for t in times if not 0 <= t < count)
             raise ValueError(
@@ -253,8 +254,9 @@ class Fly:
         starts = [n for n in range(frames) if n == 0 or times[n] != times[n - 1]]
         return [(times[a], range(a, b)) for a, b in pairwise((*starts, frames))]
 
+    @cached_property
     def _time_count(self) -> int:
-        """Returns the number of time points of the data."""
+        """The number of time points of the data."""
         from ..io.reading import open_source
         from ..io.stores.store import Store
 
@@ -268,7 +270,7 @@ class Fly:
         """Returns the time points that `--times` selects."""
         if self.scene.source.time is not None:
             raise ValueError("--times and --time both choose time points: leave one out")
-        count = self._time_count()
+        count = self._time_count
         first, last = (whole_number(n) for n in (self.times or "").partition("-")[::2])
         if self.times == "all":
             return range(count)

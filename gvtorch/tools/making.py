@@ -1,5 +1,5 @@
-"""`gvtorch voxelize` makes a store of a mesh, `gvtorch splat` one of points; `Making`: the flags of
-all commands that make a store: block size, workers, resuming.
+"""`gvtorch voxelize` makes a store of a mesh, `gvtorch splat` one of points;
+`ConversionFlags`: the flags of all commands that make a store: block size, workers, resuming.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MESH_FORMATS = "OBJ, PLY, STL, glTF or OFF, also compressed (.gz)"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Making:
+class ConversionFlags:
     """How the store is made."""
 
     # voxels along a side of a block
@@ -81,7 +81,7 @@ class Voxelize:
     # auto: closed parts are solid, others sheets; always: fill holes first; never: only sheets
     solid: Literal["auto", "always", "never"] = "auto"
 
-    making: tyro.conf.OmitArgPrefixes[Making] = Making()
+    conversion: tyro.conf.OmitArgPrefixes[ConversionFlags] = ConversionFlags()
 
     def run(self) -> None:
         from ..io.mesh_source import voxelize
@@ -89,7 +89,7 @@ class Voxelize:
         from ..io.stores.store import Store
 
         start = time.perf_counter()
-        with self.making.arguments(speed=True) as store_options:
+        with self.conversion.arguments(speed=True) as store_options:
             store = voxelize(
                 *(self.path, self.output),
                 resolution=self.resolution,
@@ -134,13 +134,13 @@ class Splat:
     # approximate memory for sorting the points
     memory: Annotated[str, option(metavar="BYTES")] = "1 GB"
 
-    making: tyro.conf.OmitArgPrefixes[Making] = Making()
+    conversion: tyro.conf.OmitArgPrefixes[ConversionFlags] = ConversionFlags()
 
     def run(self) -> None:
         from ..io.point_source import splat
 
         start = time.perf_counter()
-        with self.making.arguments() as store_options:
+        with self.conversion.arguments() as store_options:
             store = splat(
                 self.path,
                 self.output,

@@ -15,8 +15,8 @@ from tyro.conf import Positional
 
 from ..base.messages import printable
 from ..base.whole_file import write_text
+from .annotations import Annotations
 from .common import Bar, check_outputs, given_flags, option, parse_size, volume_formats
-from .drawn import Drawn
 from .look import parse_camera
 from .scene import RenderedScene, SceneFlags
 from .streaming import cost_summary
@@ -32,7 +32,7 @@ STRIP_SUFFIXES = (".npy", ".tif")  # written strip by strip: the picture may be 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Develop:
+class DevelopmentFlags:
     """How the picture is developed."""
 
     # rays per pixel, at different positions in it
@@ -96,8 +96,8 @@ class Render:
     show: Literal["picture", "samples", "nodes", "lod", "age", "fill"] = "picture"
 
     scene: tyro.conf.OmitArgPrefixes[SceneFlags] = SceneFlags()
-    develop: tyro.conf.OmitArgPrefixes[Develop] = Develop()
-    drawn: tyro.conf.OmitArgPrefixes[Drawn] = Drawn()
+    development: tyro.conf.OmitArgPrefixes[DevelopmentFlags] = DevelopmentFlags()
+    annotation: tyro.conf.OmitArgPrefixes[Annotations] = Annotations()
 
     def run(self) -> None:
         look = self.scene.look
@@ -139,7 +139,7 @@ class Render:
         from ..viewer.state import saved_state
 
         state = saved_state(self.state)
-        flags = self.scene.look.flags_set_by(state) + given_flags(self.develop)
+        flags = self.scene.look.flags_set_by(state) + given_flags(self.development)
         flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
         if flags:
             raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
@@ -163,9 +163,9 @@ class Render:
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
         )
         if self.show != "picture":
-            flags = given_flags(self.drawn)
+            flags = given_flags(self.annotation)
             if self.npz is None:
-                flags = given_flags(self.develop) + flags
+                flags = given_flags(self.development) + flags
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
@@ -173,12 +173,13 @@ class Render:
         """Renders and writes the picture of a saved state, as a page shows it."""
         from ..viewer.slices import panes
 
-        if state.composed and (flags := given_flags(self.drawn)):
+        if state.composed and (flags := given_flags(self.annotation)):
             raise ValueError(f"{flags[0]} is for a picture alone: {self.state} has slices or costs")
         settings = {"shader": state.shader, **state.settings()}
         render, cost = partial(scene.render, **settings), partial(scene.cost, **settings)
         saved_scene = replace(scene, shader=state.shader, render=render, cost=cost)
-        command = replace(self, show=state.show, develop=Develop(**vars(state.develop)))
+        development = DevelopmentFlags(**vars(state.develop))
+        command = replace(self, show=state.show, development=development)
         width, height = parse_size(self.size)
         if state.slices is not None:
             _, _, width, height = panes(width, height)["view"]
@@ -200,7 +201,8 @@ class Render:
         composed = state is not None and state.composed
         needs_whole = self.npz is not None or self.show != "picture" or composed
         strips = not needs_whole and in_strips(self.output.suffix, camera.width, camera.height)
-        render = self.develop.wrap(scene.render if strips else partial(scene.render, progress=bar))
+        render = scene.render if strips else partial(scene.render, progress=bar)
+        render = self.development.wrap(render)
         anything_seen = False
 
         def noting_render(camera: Camera) -> Picture:
@@ -243,7 +245,7 @@ class Render:
 
         world_camera, component = camera.placed(scene.box), self.scene.look.component
         eye = Eye.of(camera, scene.box) if eye is None else eye
-        return self.drawn.overlay(scene.shader, scene.info, component, world_camera, eye)
+        return self.annotation.overlay(scene.shader, scene.info, component, world_camera, eye)
 
 
 def in_strips(suffix: str, width: int, height: int) -> bool:

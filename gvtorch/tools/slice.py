@@ -28,7 +28,7 @@ class Slice:
     axis: Literal["x", "y", "z", "all"] = "z"
     # position along the axis: 50%, the index of a voxel, or a world position such as 12.5mm;
     # with --axis all also three, as in 50%,40%,12
-    at: Annotated[str, option(metavar="PLACE")] = "50%"
+    position: Annotated[str, option(metavar="PLACE")] = "50%"
     # axis that points up in the picture of one plane; if left out: as radiologists view
     # patients (see --plain); for other data -y (rows run down) across z, else +z
     up: Annotated[str | None, option(metavar="+z")] = None
@@ -58,9 +58,11 @@ class Slice:
 
         checked_path("--output", self.output, self.bits, PICTURE_SUFFIXES)
         check_outputs({"PATH": self.path, "--tf": self.tf}, {"--output": self.output})
-        positions: Any = tuple(self.at.split(","))
+        positions: Any = tuple(self.position.split(","))
         if len(positions) not in ((1, 3) if self.axis == "all" else (1,)):
-            raise ValueError(f"--at must be one place, or three for --axis all, got {self.at!r}")
+            raise ValueError(
+                f"--position must be one, or three for --axis all, got {self.position!r}"
+            )
         with Bar() as bar:
             bar("reading", 0, 0)
             data = open_data(self.path, self.source, image=self.image, level=self.level)

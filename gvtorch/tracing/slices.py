@@ -25,7 +25,7 @@ from ..pictures.picture import Picture
 from ..shaders.presets import display_grays
 from ..shaders.transfer_function import TransferFunction
 
-At = float | int | str
+Position = float | int | str
 Colors = Callable[[np.ndarray], np.ndarray]
 #: Up in the picture of the plane across each axis: rows of files run down, and heads are up.
 UP = {"x": "+z", "y": "+z", "z": "-y"}
@@ -47,7 +47,7 @@ _GAP = 4  # pixels between the three planes
 def slice_picture(
     data: Volume | Store,
     axis: str = "z",
-    at: At | tuple[At, At, At] = 0.5,
+    position: Position | tuple[Position, Position, Position] = 0.5,
     *,
     span: tuple[float, float] | None = None,
     colors: Colors | None = None,
@@ -65,8 +65,8 @@ def slice_picture(
         data: A volume, or a store, of which only the plane is read.
         axis: x, y, z, or all: the planes across y and x above the one across z, aligned so that
             rows and columns in line show the same position.
-        at: Position: a share of the extent, 0 to 1 or "50%"; an int, the index of a voxel of the
-            finest level; or world units, "12.5mm". For all axes one, or three (x, y, z).
+        position: A share of the extent, 0 to 1 or "50%"; an int, the index of a voxel of the finest
+            level; or world units, "12.5mm". For all axes one, or three (x, y, z).
         span: The values shown black and white, with visually even grays between them: if it is
             (0, 255), the values of 8-bit voxels are their sRGB numbers. If left out, what `window`
             finds, with the background.
@@ -96,19 +96,20 @@ def slice_picture(
     if axis == "all":
         if up is not None:
             raise ValueError(f"{context}: up is for one plane, not for axis 'all'")
-        if isinstance(at, tuple) and len(at) != 3:
+        positions = position if isinstance(position, tuple) else (position,) * 3
+        if len(positions) != 3:
             raise ValueError(
-                f"{context}: at must be one place or three, for x, y and z, got {at!r}"
+                f"{context}: position must be one or three, for x, y and z, got {position!r}"
             )
-        positions = dict(zip("xyz", at if isinstance(at, tuple) else (at, at, at), strict=True))
+        position_of = dict(zip("xyz", positions, strict=True))
         pixel = min(reader.spacing.values()) / scale
-        planes = (reader.colored(n, positions[n], views[n], pixel, colors) for n in "xyz")
+        planes = (reader.colored(n, position_of[n], views[n], pixel, colors) for n in "xyz")
         return _picture(_arranged(*planes))
-    if isinstance(at, tuple):
-        raise ValueError(f"{context}: at must be one place for axis {axis}, got {at!r}")
+    if isinstance(position, tuple):
+        raise ValueError(f"{context}: position must be one for axis {axis}, got {position!r}")
     pixel = min(reader.spacing[n] for n in "xyz" if n != axis) / scale
     view = views[axis] if up is None else PlaneView("", up)
-    return _picture(reader.colored(axis, at, view, pixel, colors))
+    return _picture(reader.colored(axis, position, view, pixel, colors))
 
 
 def _colors(
@@ -210,30 +211,30 @@ class _PlaneReader:
         self.origin = dict(zip("xyz", data.origin, strict=True))
         self.unit = data.info.unit
 
-    def index(self, axis: str, at: At) -> int:
+    def index(self, axis: str, position: Position) -> int:
         """Returns the index of a voxel of the finest level along an axis."""
         context, count = "slice_picture", self.finest[axis]
-        if isinstance(at, str):
-            text = at.strip()
+        if isinstance(position, str):
+            text = position.strip()
             if text.endswith("%"):
-                at = check.number(context, "at", text[:-1], low=0, high=100) / 100
+                position = check.number(context, "position", text[:-1], low=0, high=100) / 100
             elif re.fullmatch(r"[+-]?\d+", text):
-                at = int(text)
+                position = int(text)
             else:
-                return self._index_at_position(axis, text)
-        if isinstance(at, float):
-            fraction = check.number(context, "at", at, low=0, high=1)
+                return self._index_in_world(axis, text)
+        if isinstance(position, float):
+            fraction = check.number(context, "position", position, low=0, high=1)
             return min(int(fraction * count), count - 1)
-        return check.integer(context, f"at along {axis}", at, low=0, high=count - 1)
+        return check.integer(context, f"position along {axis}", position, low=0, high=count - 1)
 
-    def _index_at_position(self, axis: str, text: str) -> int:
+    def _index_in_world(self, axis: str, text: str) -> int:
         """Returns the index of the voxel at a world position, as in "12.5mm"."""
         match = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
         unit = None if match is None else length_unit(match[2])
         if match is None or unit is None:
             raise ValueError(
-                f"slice_picture: at must be a share such as 50%, the index of a voxel, or a place "
-                f"such as 12.5mm, got {text!r}"
+                "slice_picture: position must be a share such as 50%, the index of a voxel, or "
+                f"world units such as 12.5mm, got {text!r}"
             )
         position = float(match[1])
         if self.unit is not None and unit != self.unit:
@@ -247,12 +248,12 @@ class _PlaneReader:
         )
         if not 0 <= index < self.finest[axis]:
             ends = f"{low:g} to {high:g} {self.unit or ''}".rstrip()
-            raise ValueError(f"slice_picture: at {text} lies beyond the data, {axis} is {ends}")
+            raise ValueError(f"slice_picture: {text} lies beyond the data, {axis} is {ends}")
         return index
 
-    def values(self, axis: str, at: At) -> np.ndarray:
+    def values(self, axis: str, position: Position) -> np.ndarray:
         """Returns the plane across an axis, with the other two in the order z, y, x."""
-        index = self.index(axis, at) >> self.level
+        index = self.index(axis, position) >> self.level
         low, high = [0, 0, 0], [self.extent[n] for n in "zyx"]
         dimension = "zyx".index(axis)
         low[dimension], high[dimension] = index, index + 1
@@ -264,7 +265,7 @@ class _PlaneReader:
         return region[..., self.component].squeeze(dimension)
 
     def colored(
-        self, axis: str, at: At, view: PlaneView, pixel: float, colors: Colors
+        self, axis: str, position: Position, view: PlaneView, pixel: float, colors: Colors
     ) -> np.ndarray:
         """Returns (h, w, 3) float32 linear light of the plane; `pixel`: a pixel's world size."""
         up = view.up
@@ -274,7 +275,7 @@ class _PlaneReader:
                 f"slice_picture: up must be +{others[0]}, -{others[0]}, +{others[1]} or "
                 f"-{others[1]} across {axis}, got {up!r}"
             )
-        values = self.values(axis, at)
+        values = self.values(axis, position)
         if up[1] != others[0]:
             values, others = values.T, others[::-1]
         rows, columns = (_voxel_of_pixels(self.extent[n], self.spacing[n] / pixel) for n in others)

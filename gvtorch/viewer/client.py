@@ -61,9 +61,8 @@ class Client:
         self._progressive: Progressive | None = None
         self._settled, self._unchanged_frames, self._finished = False, 0, False
         self._last_sent_time = self._paused_until = 0.0
-        self._last_shown: tuple[Picture, float, bool] | None = (
-            None  # developed, milliseconds, final
-        )
+        # Developed picture, milliseconds that it took, and whether it is final.
+        self._last_shown: tuple[Picture, float, bool] | None = None
         self._planes_changed = False  # whether planes beside it have changed
         self._pixel_ms, self._fixed_ms = 5e-4, 0.0  # cost of a pixel; of a frame in addition
         self.picture: Picture | None = None
@@ -116,13 +115,8 @@ class Client:
 
     def move(self, eye: Eye, moving: bool, sent: float) -> None:
         """Sets the camera."""
-        self.eye, self._moving, self._move_time, self._move_clock = (
-            eye,
-            moving,
-            time.monotonic(),
-            sent,
-        )
-        self._finished = False
+        self.eye, self._moving, self._finished = eye, moving, False
+        self._move_time, self._move_clock = time.monotonic(), sent
 
     def mark_planes_changed(self) -> None:
         """Notes that planes beside the picture have changed, but not the picture."""

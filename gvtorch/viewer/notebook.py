@@ -62,7 +62,7 @@ def module_text() -> str:
     return _LOADER % json.dumps(modules)
 
 
-def widget(session: Session, height: int = 560) -> Any:
+def widget(session: Session) -> Any:
     """Returns the widget that shows a session in a notebook: the live page, or a PNG where widgets
     do not run; raises ImportError without anywidget.
     """
@@ -75,7 +75,7 @@ def widget(session: Session, height: int = 560) -> Any:
 
         _esm = module_text()
         _css = page_files()["style.css"].decode()
-        height = traitlets.Int(560).tag(sync=True)
+        height = traitlets.Int(560).tag(sync=True)  # pixels
 
         def __init__(self, session: Session, **options: Any) -> None:
             super().__init__(**options)
@@ -124,4 +124,4 @@ def widget(session: Session, height: int = 560) -> Any:
             self.session.close()
             self.send({"gone": "The view was closed."})
 
-    return ViewWidget(session, height=height)
+    return ViewWidget(session)

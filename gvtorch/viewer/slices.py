@@ -95,8 +95,8 @@ class Planes:
         """Returns the world position through which the planes go, clamped to the data."""
         low, high = self._corners()
         position = (low + high) / 2
-        if state.slices is not None and state.slices.at is not None:
-            position = np.array(state.slices.at)
+        if state.slices is not None and state.slices.position is not None:
+            position = np.array(state.slices.position)
         x, y, z = np.clip(position, low, high).tolist()
         return x, y, z
 
@@ -137,7 +137,7 @@ class Planes:
             image, is_current = self._image(axis, state, pixel_size, wait)
             complete &= is_current
             layout[axis] = self._plane_layout(axis, parts[axis], pixel_size) | {
-                "at": self.position(state)
+                "position": self.position(state)
             }
             if image is not None:
                 _paste(color, Pane(*layout[axis]["image"]), torch.from_numpy(image))

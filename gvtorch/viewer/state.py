@@ -137,19 +137,20 @@ class Slices:
     """Three planes of voxels beside the picture, exact to the voxel (`gv.slice_picture`).
 
     Attributes:
-        at: World position through which they go; the middle of the box if left out.
+        position: World position through which they go; the middle of the box if left out.
         window: Values shown as black and white; found automatically if left out.
         colors: Grays, or the colours of the shader (without its opacity). Labels always have
             theirs.
     """
 
-    at: Triple | None = None
+    position: Triple | None = None
     window: tuple[float, float] | None = None
     colors: Literal["gray", "shader"] = "gray"
 
     def __post_init__(self) -> None:
-        if self.at is not None:
-            object.__setattr__(self, "at", check.triple("Slices", "at", self.at))
+        if self.position is not None:
+            position = check.triple("Slices", "position", self.position)
+            object.__setattr__(self, "position", position)
         if self.window is not None:
             low, high = (check.number("Slices", "window", value) for value in self.window)
             if not low < high:

@@ -10,7 +10,7 @@ import itertools
 import os
 import struct
 from dataclasses import dataclass
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -22,6 +22,7 @@ from .format import Format, choose
 
 _MAX_HEADER_CHARS = 1 << 28
 _MAX_BLOCKS = 1 << 20
+_DTYPES = {(0, 1): "<u1", (0, 2): "<u2", (1, 4): "<f4"}  # by DataType and bytes
 _AXIS_LETTERS = {1: "x", 2: "y", 3: "z", 4: "t"}
 _OTHER_AXES = {5: "wavelengths", 9: "excitation wavelengths", 10: "tiles"}
 
@@ -57,73 +58,82 @@ def open_lif(path: str, key: str | None = None) -> LifSource:
 def _image_source(
     path: str, element: Any, blocks: dict[str, tuple[int, int]], dropped: list[str]
 ) -> LifSource:
-    channels = element.findall("./Data/Image/ImageDescription/Channels/ChannelDescription")
-    axes = element.findall("./Data/Image/ImageDescription/Dimensions/DimensionDescription")
-    sample_types = {
-        (int(c.get("DataType", 0)), -(-int(c.get("Resolution", 8)) // 8)) for c in channels
-    }
-    dtypes = {(0, 1): "<u1", (0, 2): "<u2", (1, 4): "<f4"}
-    stored = dtypes.get(next(iter(sample_types))) if len(sample_types) == 1 else None
-    if stored is None:
-        raise ValueError(f"{path}: channels of several or unknown kinds of numbers")
-    shape, strides, axis_order = [], [], ""
-    sampling: dict[str, tuple[float | None, str | None]] = {}
-    for axis in axes:
-        dimension_id, count = int(axis.get("DimID", 0)), int(axis.get("NumberOfElements", 0))
-        letter = _AXIS_LETTERS.get(dimension_id, "-")
-        if letter == "-" and count > 1:
-            axis_name = _OTHER_AXES.get(dimension_id, f"elements of the axis {dimension_id}")
-            raise ValueError(f"{path}: an image of {count} {axis_name} is not known here")
-        length = float(axis.get("Length") or 0)
-        step = abs(length) / (count - 1) if count > 1 and length else None
-        sampling[letter] = (step, axis.get("Unit"))
-        shape.append(count)
-        strides.append(int(axis.get("BytesInc", 0)))
-        axis_order += letter
+    description = "./Data/Image/ImageDescription"
+    channels = element.findall(f"{description}/Channels/ChannelDescription")
+    dimensions = element.findall(f"{description}/Dimensions/DimensionDescription")
+    stored = _stored_dtype(path, channels)
+    axes = [_axis(path, dimension) for dimension in dimensions]
     if len(channels) > 1:
-        offsets = [int(channel.get("BytesInc", 0)) for channel in channels]
-        steps = {b - a for a, b in itertools.pairwise(offsets)}
-        if len(steps) != 1:
-            raise ValueError(f"{path}: channels are not evenly spaced")
-        shape, strides = [len(channels), *shape], [steps.pop(), *strides]
-        axis_order = "c" + axis_order
+        axes.insert(0, _channel_axis(path, channels))
     offset, block_bytes = _find_block(element, blocks) or (0, 0)
-    image_bytes = sum((n - 1) * s for n, s in zip(shape, strides, strict=True)) + int(stored[2])
-    if (
-        min(shape, default=0) < 1
-        or min(strides, default=0) < 0
-        or not 0 < image_bytes <= block_bytes
-    ):
+    image_bytes = sum((axis.size - 1) * axis.stride for axis in axes) + np.dtype(stored).itemsize
+    is_valid = axes and all(axis.size >= 1 and axis.stride >= 0 for axis in axes)
+    if not is_valid or not 0 < image_bytes <= block_bytes:
         raise ValueError(
             f"{path}: the image takes {image_bytes} bytes, its block has {block_bytes}"
         )
-    spacing, unit = spacing_of(
-        [sampling.get(a, (None, None))[0] for a in "xyz"],
-        [sampling.get(a, (None, None))[1] or "m" for a in "xyz"],
-    )
+    steps = {axis.letter: axis.step for axis in axes}
+    units = {axis.letter: axis.unit or "m" for axis in axes}
+    spacing, unit = spacing_of([steps.get(a) for a in "xyz"], [units.get(a, "m") for a in "xyz"])
     if unit == "meter":  # micrometres suit microscopes
         x, y, z = (1e6 * side for side in spacing)
         spacing, unit = (x, y, z), "micrometer"
-    if unit and sampling.get("z", (1.0, None))[0] is None:
+    if unit and "z" in steps and steps["z"] is None:
         dropped.append(NO_DEPTH)
-    step = sampling.get("t", (None, None))[0]
+    time_step = steps.get("t")
     return LifSource(
         path=path,
-        shape=tuple(shape),
-        axes=axis_order,
+        shape=tuple(axis.size for axis in axes),
+        axes="".join(axis.letter for axis in axes),
         stored=stored,
         spacing=spacing,
         info=ImageInfo(
             unit=unit,
             channels=tuple(_channel(channel) for channel in channels),
-            time_step=step,
-            time_unit="second" if step else None,
+            time_step=time_step,
+            time_unit="second" if time_step else None,
         ),
         dropped=tuple(dropped),
         offset=offset,
         length=image_bytes,
-        strides=tuple(strides),
+        strides=tuple(axis.stride for axis in axes),
     )
+
+
+def _stored_dtype(path: str, channels: list[Any]) -> str:
+    """Returns the dtype that all channels have; raises ValueError if there is none."""
+    kinds = {(int(c.get("DataType", 0)), -(-int(c.get("Resolution", 8)) // 8)) for c in channels}
+    if len(kinds) != 1 or (kind := kinds.pop()) not in _DTYPES:
+        raise ValueError(f"{path}: channels of several or unknown kinds of numbers")
+    return _DTYPES[kind]
+
+
+class _Axis(NamedTuple):
+    letter: str
+    size: int
+    stride: int  # bytes
+    step: float | None = None  # between two values, in `unit`
+    unit: str | None = None
+
+
+def _axis(path: str, element: Any) -> _Axis:
+    """Returns an axis from its description."""
+    number, size = int(element.get("DimID", 0)), int(element.get("NumberOfElements", 0))
+    letter = _AXIS_LETTERS.get(number, "-")
+    if letter == "-" and size > 1:
+        name = _OTHER_AXES.get(number, f"elements of the axis {number}")
+        raise ValueError(f"{path}: an image of {size} {name} is not known here")
+    length = float(element.get("Length") or 0)
+    step = abs(length) / (size - 1) if size > 1 and length else None
+    return _Axis(letter, size, int(element.get("BytesInc", 0)), step, element.get("Unit"))
+
+
+def _channel_axis(path: str, channels: list[Any]) -> _Axis:
+    offsets = [int(channel.get("BytesInc", 0)) for channel in channels]
+    strides = {b - a for a, b in itertools.pairwise(offsets)}
+    if len(strides) != 1:
+        raise ValueError(f"{path}: channels are not evenly spaced")
+    return _Axis("c", len(channels), strides.pop())
 
 
 def _channel(element: Any) -> ChannelInfo:

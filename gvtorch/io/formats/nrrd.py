@@ -91,22 +91,19 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         (path, offset) if data_name is None else (str(Path(path).parent / data_name), 0)
     )
     size = os.stat(data_file).st_size
-    if max(skip_bytes, skip_lines) > size and encoding in ("raw", "text"):
-        raise ValueError(
-            f"{path}: skips {max(skip_bytes, skip_lines)} bytes or lines of {size} bytes"
-        )
-    if skip_bytes > _MAX_SKIPPED_BYTES and encoding not in ("raw", "text"):
-        raise ValueError(
-            f"{path}: byte skip {skip_bytes} of what is packed, at most {_MAX_SKIPPED_BYTES}"
-        )
-    start = _skip_lines(data_file, start, skip_lines)
+    # Lines are skipped in the file; then bytes, in the unpacked data.
+    max_skipped = size if encoding in ("raw", "text") else _MAX_SKIPPED_BYTES
+    if skip_bytes > max_skipped:
+        raise ValueError(f"{path}: byte skip must be at most {max_skipped}, got {skip_bytes}")
+    data_start = _skip_lines(data_file, start, skip_lines)
     if encoding == "raw":
-        needed_bytes = math.prod(shape) * np.dtype(number_dtype).itemsize
-        # -1: the numbers are at the end.
-        array_start = max(start, size - needed_bytes) if skip_bytes < 0 else start + skip_bytes
+        array_start = data_start + skip_bytes
+        if skip_bytes == -1:  # the numbers are at the end of the file
+            needed_bytes = math.prod(shape) * np.dtype(number_dtype).itemsize
+            array_start = max(start, size - needed_bytes)
         return ArraySource(file=data_file, offset=array_start, fortran=True, exact=True, **fields)
     return PackedSource(
-        file=data_file, offset=start, skip=skip_bytes, codec=encoding, fortran=True, **fields
+        file=data_file, offset=data_start, skip=skip_bytes, codec=encoding, fortran=True, **fields
     )
 
 

@@ -18,22 +18,12 @@ from typing import Any
 import numpy as np
 
 from ..packed import unpack_block
-from ..sparse_grid import (
-    COUNTS,
-    SIDES,
-    VOXELS,
-    SparseGrid,
-    SparseSource,
-    bits,
-    check_roots,
-)
+from ..sparse_grid import COUNTS, SIDES, VOXELS, SparseGrid, SparseSource, bits, check_roots
 from .format import Format, choose
 
 _MAGIC = 0x56444220
 _VERSIONS = range(220, 225)
-_MASKED_VERSION = (
-    222  # first version that packs values by masks and stores the compression of each grid
-)
+_MASKED_VERSION = 222  # first that packs values by masks and stores each grid's compression
 _MAX_GRIDS, _MAX_METADATA = 4096, 65536
 _MAX_NAME_BYTES, _MAX_TEXT_BYTES = 4096, 1 << 20  # of a name, of names and types of metadata
 _ZIP, _ACTIVE, _BLOSC = 1, 2, 4

@@ -11,6 +11,7 @@ import base64
 import io
 import math
 import mmap
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +30,16 @@ from .format import Format, choose
 
 _LONG_TYPES = {"long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8"}
 _LONG_TYPES["vtkidtype"] = "i4"  # which VTK writes as int
+_BYTE_ORDERS = {"LittleEndian": "<", "BigEndian": ">"}
+_SIZE_DTYPES = {"UInt32": "u4", "UInt64": "u8"}
+_COMPRESSORS = {
+    "": "",
+    "vtkZLibDataCompressor": "zlib",
+    "vtkLZMADataCompressor": "lzma",
+    "vtkLZ4DataCompressor": "lz4",
+}
 _MAX_HEADER_BYTES = 1 << 22
+_MAX_INLINE_BYTES = 1 << 31  # of a file whose numbers are inside its XML
 _MAX_VALUES = 1 << 33
 _MAX_ARRAYS = 64
 _MAX_LINE_BYTES = 4096  # of a line that are parsed
@@ -113,6 +123,11 @@ def open_vtk(path: str, key: str | None = None) -> VolumeSource:
     return _open_legacy(path, key) if path.lower().endswith(".vtk") else _open_xml(path, key)
 
 
+def _extent(points: Sequence[int], cells: bool) -> list[int]:
+    """Returns the values along x, y and z: at points, or in the cells between them."""
+    return [max(n - 1, 1) if cells else n for n in points]
+
+
 def _source_fields(
     path: str,
     points: Sequence[int],
@@ -121,7 +136,7 @@ def _source_fields(
     dropped: tuple[str, ...],
 ) -> dict[str, Any]:
     """Returns the fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
-    size = [max(n - 1, 1) for n in points] if array["cells"] else list(points)
+    size = _extent(points, array["cells"])
     check_extent(path, size, max_values=_MAX_VALUES)
     if array["cells"]:
         affine = affine.copy()
@@ -143,67 +158,24 @@ def _source_fields(
 
 
 def _open_xml(path: str, key: str | None) -> VolumeSource:
-    with open(path, "rb") as file:
-        content = file.read(_MAX_HEADER_BYTES)
-        file.seek(0, 2)
-        file_size = file.tell()
-    # Matched at the first tag only: with many tags that never end, time would grow as their square.
-    start = content.find(b"<AppendedData")
-    appended = (
-        re.compile(rb"<AppendedData\b[^>]*>\s*_").match(content, start) if start >= 0 else None
-    )
-    inline = appended is None
-    if inline and file_size > _MAX_HEADER_BYTES:
-        content = _read_all(path, file_size)
-    xml = content if inline else content[: appended.start()] + b"</VTKFile>"  # type: ignore[union-attr]
+    xml, appended = _read_xml(path)
     root = ElementTree.fromstring(xml)
     image, piece = _image_and_piece(path, root)
-    extent = [int(n) for n in piece.get("Extent", image.get("WholeExtent", "")).split()]
-    if len(extent) != 6:
-        raise ValueError(f"{path}: has no extent")
-    low, high = extent[::2], extent[1::2]
+    affine, points = _xml_grid(path, image, piece)
     arrays = _xml_arrays(root, piece)
     chosen, dropped = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
     if (number_dtype := number_type(array["kind"])) is None:
         raise ValueError(f"{path}: {array['name']} is of {array['kind']}; expected numbers")
-    numbers = {
-        name: np.array([float(v) for v in image.get(name, default).split()])
-        for name, default in (
-            ("Origin", "0 0 0"), ("Spacing", "1 1 1"), ("Direction", "1 0 0 0 1 0 0 0 1"),
-        )
-    }  # fmt: skip
-    affine = np.eye(4)
-    affine[:3, :3] = numbers["Direction"].reshape(3, 3) * numbers["Spacing"]
-    affine[:3, 3] = numbers["Origin"] + affine[:3, :3] @ low
-    points = [b - a + 1 for a, b in zip(low, high, strict=True)]
+    byte_order = _BYTE_ORDERS[root.get("byte_order", "LittleEndian")]
+    size_dtype = byte_order + _SIZE_DTYPES[root.get("header_type", "UInt32")]
+    compressor = _COMPRESSORS[root.get("compressor", "")]
     fields = _source_fields(path, points, affine, array, dropped)
-    byte_order = {"LittleEndian": "<", "BigEndian": ">"}[root.get("byte_order", "LittleEndian")]
-    size_dtype = byte_order + {"UInt32": "u4", "UInt64": "u8"}[root.get("header_type", "UInt32")]
-    compressor = {"": "", "vtkZLibDataCompressor": "zlib", "vtkLZMADataCompressor": "lzma",
-              "vtkLZ4DataCompressor": "lz4"}[root.get("compressor", "")]  # fmt: skip
-    stored = byte_order + number_dtype
-    if array["format"] == "appended":
-        if appended is None:
-            raise ValueError(f"{path}: has no appended data")
-        encoding = "base64" if b"base64" in appended.group() else "raw"
-        offset = appended.end() + array["offset"]
-        if not compressor and encoding == "raw":
-            source = ArraySource(
-                file=path, offset=offset + np.dtype(size_dtype).itemsize, stored=stored, **fields
-            )
-            source.check_file()
-            return source
-        length = file_size - offset
-        if length <= 0:
-            raise ValueError(
-                f"{path}: {array['name']} begins at {offset}, the file has {file_size} bytes"
-            )
-    else:
-        encoding = "ascii" if array["format"] == "ascii" else "base64"
-        offset, length = _inline_span(content, array["number"])
+    fields["stored"] = byte_order + number_dtype
+    encoding, offset, length = _xml_span(path, xml, appended, array)
+    if encoding == "raw" and not compressor:
+        return ArraySource(file=path, offset=offset + np.dtype(size_dtype).itemsize, **fields)
     return VtkSource(
-        stored=stored,
         encoding=encoding,
         compressor=compressor,
         size_dtype=size_dtype,
@@ -211,6 +183,46 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
         length=length,
         **fields,
     )
+
+
+def _read_xml(path: str) -> tuple[bytes, re.Match[bytes] | None]:
+    """Returns a file's XML without appended data, and a match that ends where these begin, if any.
+    Numbers may be inside the XML.
+    """
+    with open(path, "rb") as file:
+        content = file.read(_MAX_HEADER_BYTES)
+        # Matched at the first tag only: with many tags that never end, time would grow as their
+        # square.
+        start = content.find(b"<AppendedData")
+        tag = re.compile(rb"<AppendedData\b[^>]*>\s*_")
+        appended = tag.match(content, start) if start >= 0 else None
+        if appended is not None:
+            return content[: appended.start()] + b"</VTKFile>", appended
+        size = os.stat(path).st_size
+        if size > _MAX_INLINE_BYTES:
+            raise ValueError(
+                f"{path}: {size} bytes of XML are too many; write it with appended data"
+            )
+        return content + file.read(), None
+
+
+def _xml_grid(path: str, image: Any, piece: Any) -> tuple[np.ndarray, list[int]]:
+    """Returns (4, 4) the affine from the piece's points to the world, and their number along x, y
+    and z.
+    """
+
+    def numbers(name: str, default: str) -> np.ndarray:
+        return np.array([float(number) for number in image.get(name, default).split()])
+
+    extent = [int(n) for n in piece.get("Extent", image.get("WholeExtent", "")).split()]
+    if len(extent) != 6:
+        raise ValueError(f"{path}: has no extent")
+    low, high = extent[::2], extent[1::2]
+    direction = numbers("Direction", "1 0 0 0 1 0 0 0 1").reshape(3, 3)
+    affine = np.eye(4)
+    affine[:3, :3] = direction * numbers("Spacing", "1 1 1")
+    affine[:3, 3] = numbers("Origin", "0 0 0") + affine[:3, :3] @ low
+    return affine, [b - a + 1 for a, b in zip(low, high, strict=True)]
 
 
 def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
@@ -224,14 +236,6 @@ def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
     if len(pieces) != 1:
         raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
     return image, pieces[0]
-
-
-def _read_all(path: str, size: int) -> bytes:
-    """Reads a file whose numbers are inside its XML."""
-    if size > 1 << 31:
-        raise ValueError(f"{path}: {size} bytes of XML are too many; write it with appended data")
-    with open(path, "rb") as file:
-        return file.read()
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
@@ -257,6 +261,24 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
                 }
             )
     return sorted(arrays, key=lambda array: not array["first"])
+
+
+def _xml_span(
+    path: str, xml: bytes, appended: re.Match[bytes] | None, array: dict[str, Any]
+) -> tuple[str, int, int]:
+    """Returns how an array is encoded, where it begins in the file, and how many bytes of the file
+    may belong to it.
+    """
+    if array["format"] != "appended":
+        encoding = "ascii" if array["format"] == "ascii" else "base64"
+        return encoding, *_inline_span(xml, array["number"])
+    if appended is None:
+        raise ValueError(f"{path}: has no appended data")
+    offset = appended.end() + array["offset"]
+    size = os.stat(path).st_size
+    if offset >= size:
+        raise ValueError(f"{path}: {array['name']} begins at {offset}, the file has {size} bytes")
+    return "base64" if b"base64" in appended.group() else "raw", offset, size - offset
 
 
 def _inline_span(content: bytes, number: int) -> tuple[int, int]:
@@ -334,7 +356,7 @@ def _legacy_parts(
             affine[:3, 3] = [float(n) for n in tokens[1:4]]
         elif name in ("POINT_DATA", "CELL_DATA"):
             cells = name == "CELL_DATA"
-            count = math.prod(max(n - 1, 1) if cells else n for n in points)
+            count = math.prod(_extent(points, cells))
             if int(tokens[1]) != count:
                 raise ValueError(f"{path}: {' '.join(tokens)[:80]!r} of a grid that has {count}")
         elif name == "FIELD":
@@ -370,8 +392,7 @@ def _legacy_array(
     if not dtype:
         raise ValueError(f"{path}: {' '.join(tokens)[:80]!r} is not an array of numbers")
     check_extent(path, (*points, width), max_values=_MAX_VALUES)
-    count = math.prod(max(n - 1, 1) if cells else n for n in points) * width
-    size = np.dtype(dtype).itemsize
+    nbytes = math.prod(_extent(points, cells)) * width * np.dtype(dtype).itemsize
     return {
         "name": unquote(name),
         "first": kind in ("SCALARS", "COLOR_SCALARS"),
@@ -379,5 +400,5 @@ def _legacy_array(
         "width": width,
         "stored": ">" + dtype,
         "cells": cells,
-        "bytes": count * size,
+        "bytes": nbytes,
     }

@@ -17,10 +17,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ...base import boxes
 from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, reduce_windows, round_array
 from ..source import VolumeSource
+from .block_reader import needed_cells
 from .checksums import shard_checksums
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
-from .store import needed_cells
 from .store_layout import (
     BORDER,
     CELL,

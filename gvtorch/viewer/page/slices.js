@@ -17,7 +17,7 @@ export class SlicesView {
 
   /** The world position through which the planes go. */
   get position() {
-    return this.app.state.slices.at ?? this.layout.x.at;
+    return this.app.state.slices.position ?? this.layout.x.position;
   }
 
   /** The axis of the plane at a position in CSS pixels, or undefined. */
@@ -29,11 +29,11 @@ export class SlicesView {
 
   show(on) {
     const middle = [0, 1, 2].map((axis) => (this.app.box[0][axis] + this.app.box[1][axis]) / 2);
-    this.app.change({ slices: on ? { kind: "Slices", at: middle } : null });
+    this.app.change({ slices: on ? { kind: "Slices", position: middle } : null });
   }
 
   moveTo(position, rest) {
-    this.app.change({ slices: { ...this.app.state.slices, at: position } }, rest);
+    this.app.change({ slices: { ...this.app.state.slices, position } }, rest);
   }
 
   /** Moves the planes to the point that a plane shows at a position in CSS pixels. */

@@ -1,4 +1,4 @@
-"""`Drawn`: the flags of `gvtorch render` and `gvtorch fly` for annotations over a picture."""
+"""`Annotations`: the flags of `gvtorch render` and `gvtorch fly` for annotations over a picture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Drawn:
+class Annotations:
     """What is drawn over the picture."""
 
     # draw a colour bar of the transfer function
