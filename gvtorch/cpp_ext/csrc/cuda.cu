@@ -31,13 +31,13 @@ void splat_points(const Tensor& like, const SplatArgs& args) {
   for_each(like, args.cubes * args.side * args.side * args.side, SplatVoxel{args});
 }
 
-template <class T>
-void follow_each_point(const Tensor& like, const OrbitArgs& args) {
-  with_step<T>(args.kind,
-               [&](auto* step) { for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args}); });
-}
 void follow_points(const Tensor& like, const OrbitArgs& args) {
-  args.in_float64 ? follow_each_point<double>(like, args) : follow_each_point<float>(like, args);
+  with_real(like, [&](auto real) {
+    using T = decltype(real);
+    with_step<T>(args.kind, [&](auto* step) {
+      for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args});
+    });
+  });
 }
 
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks process their

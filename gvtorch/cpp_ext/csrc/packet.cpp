@@ -17,7 +17,7 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
       if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
     });
   }
-  const bool far_offsets = brick_bytes(args.voxel, args.side, args.channels) * args.bricks > INT32_MAX;
+  const bool far_offsets = brick_bytes(args.voxel, args.side, args.voxel_width) * args.bricks > INT32_MAX;
   with_voxel(args.voxel, [&](auto voxel) {
     using Voxel = decltype(voxel);
     if (far_offsets) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);

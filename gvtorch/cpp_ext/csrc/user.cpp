@@ -56,7 +56,7 @@ struct LibraryShader {
   static void check(const ShadeArgs& args) {
     constexpr int32_t features = FloatShader::kFeatures, uniforms = FloatShader::kUniforms;
     STD_TORCH_CHECK(args.shader == 0, "gvtorch: shader must be 0");
-    const int32_t expected = features == FloatShader::kAsOther ? args.other_channels : features;
+    const int32_t expected = features == FloatShader::kAsOther ? args.other_width : features;
     STD_TORCH_CHECK(args.features == expected, "gvtorch: features must be ", expected, ", got ", args.features);
     const int32_t uniform_count = args.parameters - kParameters;
     STD_TORCH_CHECK(uniform_count >= 0 && (uniforms < 0 || uniform_count == uniforms),

@@ -35,7 +35,7 @@ inline namespace GV_NAMESPACE {
 template <class T>
 struct UserShader : ShaderFacts {
   static constexpr bool kHidesAlike = false;
-  static constexpr bool kWhole = false;     // true: a ray must not be traced in pieces, each with its own Sum
+  static constexpr bool kWhole = false;     // true: a ray must not be traced in parts, each with its own Sum
   static constexpr int32_t kUniforms = -1;  // how many; -1, without GV_UNIFORMS: any number
   static constexpr const char* kUniformNames = "";
   using Sum = ShadeSum<T>;
@@ -63,9 +63,7 @@ struct UserShader : ShaderFacts {
   }
 
   // Composites an interval behind the previous ones: its colour (not premultiplied) and alpha.
-  GV_HD void composite(const Row<T>& row, const Piece<T>& piece, ShadeSum<T>& sum) const {
-    sum.add(row, piece.start, piece.length, sum.hit_clear);
-  }
+  GV_HD void composite(const Row<T>& row, const Piece<T>& piece, ShadeSum<T>& sum) const { sum.add(row, piece); }
 
   // True if the transfer function shows no value in [low, high].
   GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
@@ -151,13 +149,7 @@ struct CalledShader : Kind<T> {
  private:
   __attribute__((noinline)) void add_lane(int lane, const Piece<Floats>& pieces, const Probe<T>& probe,
                                           UserSums<Sum>& sums) const {
-    Piece<float> piece;
-    piece.start = pieces.start[lane];
-    piece.end = pieces.end[lane];
-    piece.middle = pieces.middle[lane];
-    piece.length = pieces.length[lane];
-    piece.level = pieces.level[lane];
-    piece.odd = pieces.odd;
+    auto piece = take_lane<Piece<float>>(pieces, lane);
     if constexpr (Base::kEnds) {
       piece.front = pieces.front[lane];
       piece.back = pieces.back[lane];

@@ -4,10 +4,10 @@
 //
 // `kind` is one of the types below: it defines the argument's type in the op's schema, what torch passes, the dtype of
 // a tensor, and what kernels get. `limit` keeps memory safe: how many numbers a tensor holds, or what an int is below
-// (it is never negative); kAny where that is checked elsewhere. It is an expression of sizes that are known in the
-// function that expands the list. An X makes one thing of each line:
+// (it is never negative); kAny where that is checked elsewhere. It is an expression of sizes that the function that
+// expands the list has stored in `args`, the kernels' struct, or named. An X makes one thing of each line:
 //
-//   GV_VIEW    a member of the struct that kernels read
+//   GV_VIEW    a member of the struct that kernels read; GV_TYPED_VIEW, of a struct template of the real type T
 //   GV_FIELD   a member of the struct that torch fills (in entry.h, like those below)
 //   GV_SCHEMA  its text in the schema
 //   GV_TYPE    its type, in the order of the schema
@@ -30,14 +30,18 @@ constexpr int64_t kAny = -1;
 
 namespace kinds {
 
-struct AnyReal;   // float32 or float64: the dtype in which an op computes
+struct AnyReal;   // float32 or float64: the real type, in which an op computes
 struct AnyVoxel;  // the dtype of a channel
 
+// A kind's View<Real> is what kernels get; Real: the real type, or void if only a kernel knows it.
+//
 // A tensor of T. kAlias: it is written in place, under this letter of the schema. kOptional: it may be None.
 template <class T, char kAlias = 0, bool kOptional = false>
 struct TensorOf {
-  using Number = std::conditional_t<std::is_class_v<T>, void, T>;
-  using View = std::conditional_t<kAlias == 0, const Number*, Number*>;
+  template <class Real>
+  using Number = std::conditional_t<std::is_same_v<T, AnyReal>, Real, std::conditional_t<std::is_class_v<T>, void, T>>;
+  template <class Real>
+  using View = std::conditional_t<kAlias == 0, const Number<Real>*, Number<Real>*>;
 };
 using World = TensorOf<double>;
 using MaybeWorld = TensorOf<double, 0, true>;
@@ -60,7 +64,8 @@ using WrittenBytes = TensorOf<uint8_t, kAlias>;
 
 template <class T>
 struct NumberOf {
-  using View = T;
+  template <class Real>
+  using View = std::conditional_t<std::is_same_v<T, double> && !std::is_void_v<Real>, Real, T>;
 };
 using Int = NumberOf<int32_t>;
 using Count = NumberOf<int64_t>;  // an int of any size, in the schema a SymInt: torch.compile need not know it
@@ -69,43 +74,43 @@ using Bool = NumberOf<bool>;
 
 }  // namespace kinds
 
-// World rays. Sizes in limits: rays
-#define GV_RAYS(X)                 \
-  X(World, origin_r3, 3 * rays)    \
-  X(World, direction_r3, 3 * rays) \
-  X(World, cone_r2, 2 * rays)      \
-  X(World, range_r2, 2 * rays)     \
-  X(Int, width, kAny)              \
-  X(MaybeWorld, clear_r, rays)
+// World rays.
+#define GV_RAYS(X)                      \
+  X(World, origin_r3, 3 * args.rays)    \
+  X(World, direction_r3, 3 * args.rays) \
+  X(World, cone_r2, 2 * args.rays)      \
+  X(World, range_r2, 2 * args.rays)     \
+  X(Int, width, kAny)                   \
+  X(MaybeWorld, clear_r, args.rays)
 
-// Placement and shape of the tree, how rays are cut, and a channel. Sizes in limits: side, nodes, channels
-#define GV_CHANNEL(X)            \
-  X(World, place_33, 9)          \
-  X(Int, branching, 17)          \
-  X(Int, max_depth, kMaxLevels)  \
-  X(Int, border, (side + 1) / 2) \
-  X(Float, root_voxel, kAny)     \
-  X(Float, cone_scale, kAny)     \
-  X(Float, step, kAny)           \
-  X(Voxels, bricks_bzyxc, kAny)  \
-  X(Voxels, constant_tnc, nodes* channels)
+// Placement and shape of the tree, how rays are cut, and a channel.
+#define GV_CHANNEL(X)                 \
+  X(World, place_33, 9)               \
+  X(Int, branching, 17)               \
+  X(Int, max_depth, kMaxLevels)       \
+  X(Int, border, (args.side + 1) / 2) \
+  X(Float, root_voxel, kAny)          \
+  X(Float, cone_scale, kAny)          \
+  X(Float, step, kAny)                \
+  X(Voxels, bricks_bzyxc, kAny)       \
+  X(Voxels, constant_tnc, args.nodes* args.voxel_width)
 
-// Node pool, transfer function, and where rays end. Sizes in limits: channels, nodes, tiles, bricks, table, rows
-#define GV_WALK(X)                            \
-  X(Voxels, range_tn2c, 2 * nodes * channels) \
-  X(Int, component, channels)                 \
-  X(Words, child_tn, nodes)                   \
-  X(Words, brick_tn, nodes)                   \
-  X(Requests<'a'>, request_tn, nodes)         \
-  X(Written<'b'>, stamp_t, tiles)             \
-  X(Written<'c'>, stamp_b, bricks)            \
-  X(Words, frame_1, 1)                        \
-  X(Int, root, nodes)                         \
-  X(Reals, table_lm4, table)                  \
-  X(Reals, domain_2, 2)                       \
-  X(Words, opaque_m, rows)                    \
-  X(Float, stop_alpha, kAny)                  \
-  X(Float, depth_alpha, kAny)                 \
+// Node pool, transfer function, and where rays end. Sizes in limits: tiles, table, rows
+#define GV_WALK(X)                                         \
+  X(Voxels, range_tn2c, 2 * args.nodes * args.voxel_width) \
+  X(Int, component, args.voxel_width)                      \
+  X(Words, child_tn, args.nodes)                           \
+  X(Words, brick_tn, args.nodes)                           \
+  X(Requests<'a'>, request_tn, args.nodes)                 \
+  X(Written<'b'>, stamp_t, tiles)                          \
+  X(Written<'c'>, stamp_b, args.bricks)                    \
+  X(Words, frame_1, 1)                                     \
+  X(Int, root, args.nodes)                                 \
+  X(Reals, table_lm4, table)                               \
+  X(Reals, domain_2, 2)                                    \
+  X(Words, opaque_m, rows)                                 \
+  X(Float, stop_alpha, kAny)                               \
+  X(Float, depth_alpha, kAny)                              \
   X(Bool, by_level, kAny)
 
 // What a shader reads in addition.
@@ -119,7 +124,8 @@ using Bool = NumberOf<bool>;
   X(Int, other_component, kAny)      \
   X(Reals, parameter_54, kAny)
 
-#define GV_VIEW(kind, name, limit) kinds::kind::View name;
+#define GV_VIEW(kind, name, limit) kinds::kind::View<void> name;
+#define GV_TYPED_VIEW(kind, name, limit) kinds::kind::template View<T> name{};
 
 struct TraceArgs {
   GV_RAYS(GV_VIEW)
@@ -133,7 +139,9 @@ struct TraceArgs {
 
   int64_t rays, bricks, nodes;
   VoxelType voxel;
-  int32_t nodes_per_tile, side, channels, rows, levels;
+  int32_t nodes_per_tile, side;
+  int32_t voxel_width;    // numbers per voxel
+  int32_t rows, lengths;  // of the table: of the transfer function, for each length of interval
 };
 
 enum class LightKind { kHeadlight, kDirectional, kPoint };
@@ -161,8 +169,8 @@ struct ShadeArgs : TraceArgs {
   GV_SHADE(GV_VIEW)
 
   VoxelType normal_voxel, other_voxel;
-  int32_t other_channels, other_bricks;
-  int32_t parameters;  // how many numbers parameter_54 has: kParameters, then a user's uniforms
+  int32_t other_width, other_bricks;  // numbers per voxel of the second channel; how many bricks have it
+  int32_t parameters;                 // how many numbers parameter_54 has: kParameters, then a user's uniforms
   void *normal_r3, *features_rc;
 };
 

@@ -65,10 +65,10 @@ GV_HD T pick(const T* table, int32_t index) {
   return table[index];
 }
 
-// The same number in every lane.
+// The same number in every lane. Subtracting 0 changes no bit.
 template <class T, class Number>
-GV_HD T splat(Number value) {
-  return static_cast<T>(value);
+GV_HD T broadcast(Number value) {
+  return value - T{};
 }
 // A whole number as a T.
 template <class T>
@@ -147,18 +147,6 @@ GV_HD void set_lane(Vec3<T>& value, int lane, const Vec3<float>& lane_value) {
   for (int axis = 0; axis < 3; ++axis) set_lane(value[axis], lane, lane_value[axis]);
 }
 
-template <>
-GV_HD Floats splat<Floats, float>(float value) {
-  return value - Floats{};
-}
-template <>
-GV_HD Doubles splat<Doubles, double>(double value) {
-  return value - Doubles{};
-}
-template <>
-GV_HD Ints splat<Ints, int32_t>(int32_t value) {
-  return value - Ints{};
-}
 template <class T>
 GV_HD T to_real(Ints value) {
   return to_floats(value);
@@ -167,8 +155,9 @@ template <class T>
 GV_HD T to_real(Longs value) {
   return __builtin_convertvector(value, T);
 }
+GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
 GV_HD Floats clamp(Floats value, float low, float high) {
-  return clamp(value, splat<Floats>(low), splat<Floats>(high));
+  return clamp(value, broadcast<Floats>(low), broadcast<Floats>(high));
 }
 #endif
 
@@ -187,9 +176,35 @@ GV_HD MaskOf<T> all_lanes() {
 template <class T>
 constexpr bool kPacket = LanesOf<T>::kPacket;
 
+// Defines a struct's `each_member`, which calls body(a's member, b's member) for each member that differs between
+// lanes. `calls`: GV_BOTH(member) of each, and each_member(a, b, body) of its base.
+#define GV_BOTH(member) body(a.member, b.member);
+#define GV_EACH_MEMBER(calls)                                   \
+  template <class A, class B, class Body>                       \
+  GV_HD static void each_member(A& a, B& b, const Body& body) { \
+    calls                                                       \
+  }
+
+// Copies one lane out of a struct of all lanes, and back.
+template <class Lane, class Lanes>
+GV_HD Lane take_lane(const Lanes& lanes, int lane) {
+  Lane result;
+  Lanes::each_member(lanes, result, [&](const auto& member, auto& out) { out = lane_of(member, lane); });
+  return result;
+}
+template <class Lanes, class Lane>
+GV_HD void put_lane(Lanes& lanes, int lane, const Lane& lane_struct) {
+  Lanes::each_member(lanes, lane_struct, [&](auto& member, const auto& in) { set_lane(member, lane, in); });
+}
+
 template <class T>
 GV_HD T absolute(T value) {
   return larger(value, -value);
+}
+// The value clamped to [0, 1].
+template <class T>
+GV_HD T saturate(T value) {
+  return clamp(value, static_cast<RealOf<T>>(0), static_cast<RealOf<T>>(1));
 }
 
 // floor of a value that fits an int32; lanes that are not used may hold any value. Without SSE4.1 (the baseline of
@@ -211,7 +226,7 @@ GV_HD T log2_exact(T value) {
   const T exponent = to_real<T>(select(large, power + 1, power));
   const T s = (mantissa - 1.0f) / (mantissa + 1.0f);
   const T z = s * s;
-  T series = splat<T>(0.320598898f);
+  T series = broadcast<T>(0.320598898f);
   series = series * z + 0.412198583f;
   series = series * z + 0.577078016f;
   series = series * z + 0.961796694f;
@@ -222,7 +237,7 @@ GV_HD T log2_exact(T value) {
 // (2^f - 1) / f for f in [-0.5, 0.5].
 template <class T>
 GV_HD T exp2_slope(T f) {
-  T series = splat<T>(1.52527338e-5f);
+  T series = broadcast<T>(1.52527338e-5f);
   series = series * f + 1.54035304e-4f;
   series = series * f + 1.33335581e-3f;
   series = series * f + 9.61812911e-3f;
@@ -236,7 +251,7 @@ template <class T>
 GV_HD T exp2_exact(T value) {
   const auto normal = value > -126.0f;
   if (!any(normal)) return T{};
-  const T x = smaller(value, splat<T>(126.0f));
+  const T x = smaller(value, broadcast<T>(126.0f));
   const auto integer = floor_int(x + 0.5f);
   const T f = x - to_real<T>(integer);
   const T series = exp2_slope(f) * f + 1.0f;
@@ -282,7 +297,7 @@ GV_HD LogParts<T> log_parts(T value) {
   const T exponent = to_real<T>(select(large, power, power - 1));
   const T s = (mantissa - static_cast<Real>(1)) / (mantissa + static_cast<Real>(1));
   const T z = s * s;
-  T series = splat<T>(static_cast<Real>(2.0 / 19));
+  T series = broadcast<T>(static_cast<Real>(2.0 / 19));
   for (int32_t odd = 17; odd > 0; odd -= 2) series = series * z + static_cast<Real>(2.0 / odd);
   return {exponent, s, series};
 }
@@ -318,6 +333,14 @@ GV_HD double exp2_exact(double value) {
   const double f = x - integer;
   return (exp2_slope(f) * f + 1.0) * bit_cast<double>(static_cast<int64_t>(integer + 1023) << 52);
 }
+
+// A range of indices, clamped to [0, count] whatever `ends` holds.
+struct Span {
+  int64_t begin, end;
+
+  GV_HD Span(const int64_t* ends, int64_t count)
+      : begin(clamp<int64_t>(ends[0], 0, count)), end(clamp<int64_t>(ends[1], 0, count)) {}
+};
 
 // The share of light absorbed after `halvings` halvings: 1 - 2^-halvings, without cancellation where that is small.
 template <class T>

@@ -25,6 +25,13 @@
 #define GV_RARE GV_CALL
 #endif
 
+// Before a loop that nvcc must not unroll.
+#ifdef __CUDA_ARCH__
+#define GV_NO_UNROLL _Pragma("unroll 1")
+#else
+#define GV_NO_UNROLL
+#endif
+
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
@@ -87,22 +94,6 @@ GV_HD void store_stamp(int32_t* word, int32_t stamp) {
   if (*word != stamp) *word = stamp;
 #else
   if (__atomic_load_n(word, __ATOMIC_RELAXED) != stamp) __atomic_store_n(word, stamp, __ATOMIC_RELAXED);
-#endif
-}
-
-// Access to a byte into which several threads may write the same value.
-GV_HD uint8_t load_byte(const uint8_t* byte) {
-#ifdef __CUDA_ARCH__
-  return *byte;
-#else
-  return __atomic_load_n(byte, __ATOMIC_RELAXED);
-#endif
-}
-GV_HD void store_byte(uint8_t* byte, uint8_t value) {
-#ifdef __CUDA_ARCH__
-  *byte = value;
-#else
-  __atomic_store_n(byte, value, __ATOMIC_RELAXED);
 #endif
 }
 

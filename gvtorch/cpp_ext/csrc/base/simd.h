@@ -45,15 +45,13 @@ GV_HD Ints lane_numbers() {
   return lane;
 }
 
-// As in arithmetic.h, also in which of two is returned if one is NaN.
+// As in arithmetic.h, also in which of two is returned if one is NaN; minimum and maximum without GV_MM are its own.
 #ifdef GV_MM
 GV_HD Floats smaller(Floats a, Floats b) { return (Floats)GV_MM(min_ps)((Native)b, (Native)a); }
 GV_HD Floats larger(Floats a, Floats b) { return (Floats)GV_MM(max_ps)((Native)b, (Native)a); }
 GV_HD Floats square_root(Floats value) { return (Floats)GV_MM(sqrt_ps)((Native)value); }
 GV_HD Doubles square_root(Doubles value) { return (Doubles)GV_MM(sqrt_pd)((decltype(GV_MM(setzero_pd)()))value); }
 #else
-GV_HD Floats smaller(Floats a, Floats b) { return b < a ? b : a; }
-GV_HD Floats larger(Floats a, Floats b) { return b > a ? b : a; }
 template <class T>
 GV_HD T root_of_each(T value) {
   for (size_t i = 0; i < sizeof(value) / sizeof(value[0]); ++i) value[i] = sqrt(value[i]);
@@ -62,10 +60,6 @@ GV_HD T root_of_each(T value) {
 GV_HD Floats square_root(Floats value) { return root_of_each(value); }
 GV_HD Doubles square_root(Doubles value) { return root_of_each(value); }
 #endif
-GV_HD Ints smaller(Ints a, Ints b) { return b < a ? b : a; }
-GV_HD Ints larger(Ints a, Ints b) { return b > a ? b : a; }
-// value > low ? value : low, then raised < high ? raised : high.
-GV_HD Floats clamp(Floats value, Floats low, Floats high) { return smaller(high, larger(low, value)); }
 // The set lanes as bits.
 GV_HD uint32_t bits(Mask mask) {
 #if defined(__AVX512F__)
@@ -198,40 +192,21 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
 
 // Converts the voxel in the low bytes of each word to a number.
 template <class Voxel>
-struct Unpack;
-template <>
-struct Unpack<uint8_t> {
-  GV_HD static Floats low(Ints word) { return to_floats(word & 0xff); }
-};
-template <>
-struct Unpack<int8_t> {
-  GV_HD static Floats low(Ints word) { return to_floats((word << 24) >> 24); }
-};
-template <>
-struct Unpack<uint16_t> {
-  GV_HD static Floats low(Ints word) { return to_floats(word & 0xffff); }
-};
-template <>
-struct Unpack<int16_t> {
-  GV_HD static Floats low(Ints word) { return to_floats((word << 16) >> 16); }
-};
-template <>
-struct Unpack<BFloat16> {
-  GV_HD static Floats low(Ints word) { return (Floats)(word << 16); }
-};
-template <>
-struct Unpack<Half> {
-  GV_HD static Floats low(Ints word) {
+GV_HD Floats unpack(Ints word) {
+  if constexpr (std::is_same_v<Voxel, float>) {
+    return (Floats)word;
+  } else if constexpr (std::is_same_v<Voxel, BFloat16>) {
+    return (Floats)(word << 16);
+  } else if constexpr (std::is_same_v<Voxel, Half>) {
     const Ints magnitude = (word & 0x7fff) << 13;
     const Floats scaled = (Floats)magnitude * 5.192296858534828e33f;  // see `number` in hd.h
     const Ints value = magnitude < (0x7c00 << 13) ? (Ints)scaled : magnitude | 0x7f800000;
     return (Floats)(value | ((word & 0x8000) << 16));
+  } else {
+    constexpr int kBits = 8 * sizeof(Voxel), kUnused = 32 - kBits;
+    return to_floats(std::is_signed_v<Voxel> ? (word << kUnused) >> kUnused : word & ((1 << kBits) - 1));
   }
-};
-template <>
-struct Unpack<float> {
-  GV_HD static Floats low(Ints word) { return (Floats)word; }
-};
+}
 
 // Converts four consecutive voxels to numbers.
 typedef float Floats4 __attribute__((vector_size(16)));

@@ -81,13 +81,12 @@ struct ListRequests {
   }
 };
 
-// Sizes in limits: lists, listed, tiles
-#define GV_CHOOSE_REQUESTS(X)             \
-  X(Words, asked_l2k, 2 * lists * listed) \
-  X(Words, loc_t4, 4 * tiles)             \
-  X(Longs, room_2, 2)                     \
-  X(Int, per_tile, kAny)                  \
-  X(Int, batch, kAny)                     \
+#define GV_CHOOSE_REQUESTS(X)                       \
+  X(Words, asked_l2k, 2 * args.lists * args.listed) \
+  X(Words, loc_t4, 4 * args.tiles)                  \
+  X(Longs, room_2, 2)                               \
+  X(Int, per_tile, kAny)                            \
+  X(Int, batch, kAny)                               \
   X(Bool, coarse_first, kAny)
 
 constexpr int64_t kNoKey = INT64_MAX;      // not a request of a node of the pool
@@ -239,7 +238,7 @@ struct SplitByUse : UseArgs {
 #define GV_UNLINK(X)                \
   X(Written<'a'>, pointer_tn, kAny) \
   X(Written<'b'>, owner_s, kAny)    \
-  X(Flags, shared_s, slots)         \
+  X(Flags, shared_s, args.slots)    \
   X(Words, slot_k, kAny)
 
 struct UnlinkArgs {
@@ -297,11 +296,11 @@ struct ClearOwner {
   }
 };
 
-#define GV_LINK(X)                    \
-  X(Written<'a'>, pointer_tn, kAny)   \
-  X(Requests<'b'>, request_tn, nodes) \
-  X(Words, node_k, kAny)              \
-  X(Words, word_k, count)             \
+#define GV_LINK(X)                         \
+  X(Written<'a'>, pointer_tn, kAny)        \
+  X(Requests<'b'>, request_tn, args.nodes) \
+  X(Words, node_k, kAny)                   \
+  X(Words, word_k, count)                  \
   X(Int, kind, kAny)
 
 // node_k holds each node at most once; -1 is an unused entry.
@@ -317,15 +316,15 @@ struct WritePointer {
   }
 };
 
-#define GV_LINK_BRICKS(X)               \
-  X(Written<'a'>, brick_tn, kAny)       \
-  X(Requests<'b'>, request_tn, nodes)   \
-  X(Written<'c'>, owner_b, kAny)        \
-  X(Written<'d'>, stamp_b, slots)       \
-  X(Written<'e'>, born_b, slots)        \
-  X(WrittenFlags<'f'>, shared_b, slots) \
-  X(Longs, node_k, kAny)                \
-  X(Words, slot_k, count)               \
+#define GV_LINK_BRICKS(X)                    \
+  X(Written<'a'>, brick_tn, kAny)            \
+  X(Requests<'b'>, request_tn, args.nodes)   \
+  X(Written<'c'>, owner_b, kAny)             \
+  X(Written<'d'>, stamp_b, args.slots)       \
+  X(Written<'e'>, born_b, args.slots)        \
+  X(WrittenFlags<'f'>, shared_b, args.slots) \
+  X(Longs, node_k, kAny)                     \
+  X(Words, slot_k, count)                    \
   X(Words, frame_1, 1)
 
 // Links nodes to the bricks in slots, and makes the nodes their owners.
@@ -346,22 +345,22 @@ struct LinkBrick {
   }
 };
 
-#define GV_LINK_TILES(X)                        \
-  X(Written<'a'>, child_tn, tiles* per_tile)    \
-  X(Written<'b'>, brick_tn, tiles* per_tile)    \
-  X(Requests<'c'>, request_tn, tiles* per_tile) \
-  X(Written<'d'>, loc_t4, 4 * tiles)            \
-  X(Written<'e'>, parent_t, tiles)              \
-  X(Written<'f'>, tree_t, tiles)                \
-  X(Written<'g'>, stamp_t, tiles)               \
-  X(WrittenFlags<'h'>, shared_t, tiles)         \
-  X(Words, child_jw, rows* width)               \
-  X(Words, brick_jw, rows* width)               \
-  X(Longs, node_j, rows)                        \
-  X(Longs, loc_j4, 4 * rows)                    \
-  X(Longs, row_k, kAny)                         \
-  X(Words, tile_k, count)                       \
-  X(Int, tree, kAny)                            \
+#define GV_LINK_TILES(X)                                  \
+  X(Written<'a'>, child_tn, args.tiles* args.per_tile)    \
+  X(Written<'b'>, brick_tn, args.tiles* args.per_tile)    \
+  X(Requests<'c'>, request_tn, args.tiles* args.per_tile) \
+  X(Written<'d'>, loc_t4, 4 * args.tiles)                 \
+  X(Written<'e'>, parent_t, args.tiles)                   \
+  X(Written<'f'>, tree_t, args.tiles)                     \
+  X(Written<'g'>, stamp_t, args.tiles)                    \
+  X(WrittenFlags<'h'>, shared_t, args.tiles)              \
+  X(Words, child_jw, args.rows* args.width)               \
+  X(Words, brick_jw, args.rows* args.width)               \
+  X(Longs, node_j, args.rows)                             \
+  X(Longs, loc_j4, 4 * args.rows)                         \
+  X(Longs, row_k, kAny)                                   \
+  X(Words, tile_k, count)                                 \
+  X(Int, tree, kAny)                                      \
   X(Words, frame_1, 1)
 
 // Writes tiles and links them to their parent nodes: an index is a node of a tile. Nodes beyond the tree's N^3 become

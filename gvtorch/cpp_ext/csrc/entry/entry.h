@@ -159,9 +159,10 @@ Number to_kernel(Number number) {
   return number;
 }
 
-#define GV_CHECK(kind, name, limit) check(kinds::kind{}, a.name, #name, like, limit);
 // Checks an argument of `a`, and stores it in the kernels' `args`.
-#define GV_CHECK_AND_SET(kind, name, limit) GV_CHECK(kind, name, limit) args.name = to_kernel(a.name);
+#define GV_CHECK_AND_SET(kind, name, limit)         \
+  check(kinds::kind{}, a.name, #name, like, limit); \
+  args.name = to_kernel(a.name);
 
 // Makes a tensor for the kernels to fill, of the pointer's dtype, or of that of `like` if the pointer is void.
 template <class T>
@@ -170,6 +171,14 @@ Tensor make_output(T*& pointer, const Tensor& like, std::initializer_list<int64_
   if constexpr (!std::is_void_v<T>) dtype = CppTypeToScalarType<T>::value;
   Tensor output = torch::stable::new_empty(like, shape, dtype);
   pointer = to_kernel(output);
+  return output;
+}
+
+// The same, filled with 0.
+template <class T>
+Tensor make_zeros(T*& pointer, const Tensor& like, std::initializer_list<int64_t> shape) {
+  Tensor output = make_output(pointer, like, shape);
+  torch::stable::zero_(output);
   return output;
 }
 
@@ -188,14 +197,20 @@ inline bool is_float64(const Tensor& tensor) {
   return dtype == ScalarType::Double;
 }
 
+// Returns body(T{}), with T float or double, as is_float64.
+template <class Body>
+auto with_real(const Tensor& tensor, const Body& body) {
+  return is_float64(tensor) ? body(double{}) : body(float{});
+}
+
 // Checks the bricks of any channel; returns their side, border included.
-inline int64_t check_bricks(const Tensor& bricks_bzyxc) {
+inline int32_t check_bricks(const Tensor& bricks_bzyxc) {
   STD_TORCH_CHECK(bricks_bzyxc.dim() == 5 && bricks_bzyxc.size(1) >= 2 && bricks_bzyxc.size(1) <= 1024 &&
                       bricks_bzyxc.size(1) == bricks_bzyxc.size(2) && bricks_bzyxc.size(2) == bricks_bzyxc.size(3),
                   "gvtorch: bricks must be (b, s, s, s, c) with s >= 2");
   const int64_t side = bricks_bzyxc.size(1);
   STD_TORCH_CHECK(side * side * side * bricks_bzyxc.size(4) <= INT32_MAX / 8, "gvtorch: a brick is too large");
-  return side;
+  return static_cast<int32_t>(side);
 }
 
 // Checks and stores the arguments that all ops on rays and bricks have in common.
@@ -203,19 +218,18 @@ template <class Op>
 void set_channel_args(TraceArgs& args, const Op& a, const Like& like, int64_t nodes) {
   STD_TORCH_CHECK(a.origin_r3.dim() == 2 && a.origin_r3.size(1) == 3 && a.origin_r3.size(0) <= INT32_MAX,
                   "gvtorch: origin_r3 must be (r, 3)");
-  const int64_t rays = a.origin_r3.size(0), side = check_bricks(a.bricks_bzyxc), channels = a.bricks_bzyxc.size(4);
-  GV_RAYS(GV_CHECK_AND_SET)
-  GV_CHANNEL(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(nodes <= INT32_MAX, "gvtorch: too many nodes");
-  STD_TORCH_CHECK(a.branching >= 2 && std::pow(a.branching, a.max_depth) <= kMaxNodes,
-                  "gvtorch: branching or max_depth out of range");
-  STD_TORCH_CHECK(a.step > 0 && a.root_voxel > 0, "gvtorch: step and root_voxel must be positive");
-  args.rays = rays;
+  args.rays = a.origin_r3.size(0);
   args.bricks = a.bricks_bzyxc.size(0);
   args.nodes = nodes;
   args.voxel = voxel_type(like.voxel);
-  args.side = static_cast<int32_t>(side);
-  args.channels = static_cast<int32_t>(channels);
+  args.side = check_bricks(a.bricks_bzyxc);
+  args.voxel_width = static_cast<int32_t>(a.bricks_bzyxc.size(4));
+  GV_RAYS(GV_CHECK_AND_SET)
+  GV_CHANNEL(GV_CHECK_AND_SET)
+  STD_TORCH_CHECK(a.branching >= 2 && std::pow(a.branching, a.max_depth) <= kMaxNodes,
+                  "gvtorch: branching or max_depth out of range");
+  STD_TORCH_CHECK(a.step > 0 && a.root_voxel > 0, "gvtorch: step and root_voxel must be positive");
 }
 
 // Checks and stores the arguments that all ops that walk rays have in common. integrates: the table is (l, m, m, 4).
@@ -232,19 +246,18 @@ ShadeArgs make_walk_args(const Op& a, bool integrates = false) {
   set_channel_args(args, a, like, nodes);
   STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
                   "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
-  const int64_t bricks = args.bricks, channels = args.channels;
-  const int64_t levels = a.table_lm4.size(0), rows = a.table_lm4.size(1);
-  const int64_t table = 4 * levels * rows * (integrates ? rows : 1);
+  const int64_t lengths = a.table_lm4.size(0), rows = a.table_lm4.size(1);
+  const int64_t table = 4 * lengths * rows * (integrates ? rows : 1);
   GV_WALK(GV_CHECK_AND_SET)
   if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
-  STD_TORCH_CHECK(levels <= INT32_MAX && rows <= INT32_MAX && table <= INT32_MAX, "gvtorch: table_lm4 is too large");
+  STD_TORCH_CHECK(lengths <= INT32_MAX && rows <= INT32_MAX && table <= INT32_MAX, "gvtorch: table_lm4 is too large");
   STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(args.table_lm4) % 16 == 0,
                   "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
   args.nodes_per_tile = static_cast<int32_t>(a.child_tn.size(1));
   args.rows = static_cast<int32_t>(rows);
-  args.levels = static_cast<int32_t>(levels);
+  args.lengths = static_cast<int32_t>(lengths);
   return args;
 }
 
@@ -265,17 +278,18 @@ inline int32_t check_second_channel(const std::optional<Tensor>& bricks_bzyxc,
   STD_TORCH_CHECK(coarse || bricks_bzyxc.has_value() == constant_tnc.has_value(), "gvtorch: ", name,
                   " needs bricks and constants");
   if (!bricks_bzyxc.has_value()) return 0;
-  const int64_t side = check_bricks(*bricks_bzyxc), channels = bricks_bzyxc->size(4), bricks = bricks_bzyxc->size(0);
-  STD_TORCH_CHECK((bricks == args.bricks || (coarse && bricks < args.bricks)) && side == args.side && channels >= 1 &&
-                      (width == 0 || channels == width),
+  const int32_t side = check_bricks(*bricks_bzyxc);
+  const int64_t own_width = bricks_bzyxc->size(4), bricks = bricks_bzyxc->size(0);
+  STD_TORCH_CHECK((bricks == args.bricks || (coarse && bricks < args.bricks)) && side == args.side && own_width >= 1 &&
+                      (width == 0 || own_width == width),
                   "gvtorch: ", name, " has the wrong shape");
   if (constant_tnc.has_value()) {
     STD_TORCH_CHECK(
-        constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == args.nodes * channels,
+        constant_tnc->scalar_type() == bricks_bzyxc->scalar_type() && constant_tnc->numel() == args.nodes * own_width,
         "gvtorch: the constants of ", name, " have the wrong dtype or size");
   }
   voxel = voxel_type(bricks_bzyxc->scalar_type());
-  return static_cast<int32_t>(channels);
+  return static_cast<int32_t>(own_width);
 }
 
 // The shaders of a library: what they require of their arguments, and `run`, which shades all rays. A user's library
@@ -294,13 +308,13 @@ struct FusedShaders {
     with_shader<float>(args.shader, [&](auto type) {
       using Shader = typename decltype(type)::Shader;
       const bool by_other = Shader::kFeatures == Shader::kAsOther;
-      STD_TORCH_CHECK(!by_other || args.other_channels > 0, "gvtorch: other_bzyxc is missing");
-      const bool colored = (args.channels == 4 || args.channels == 4 * kDirections) && args.component == 3;
+      STD_TORCH_CHECK(!by_other || args.other_width > 0, "gvtorch: other_bzyxc is missing");
+      const bool colored = (args.voxel_width == 4 || args.voxel_width == 4 * kDirections) && args.component == 3;
       STD_TORCH_CHECK(!Shader::kColored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
       constexpr int32_t kNumbers = Shader::kFiltered;
-      const bool sided = args.other_channels == kNumbers || args.other_channels == kNumbers * kDirections;
+      const bool sided = args.other_width == kNumbers || args.other_width == kNumbers * kDirections;
       STD_TORCH_CHECK(kNumbers == 0 || sided, "gvtorch: other_bzyxc must hold filtered colours");
-      STD_TORCH_CHECK(args.features == (by_other ? args.other_channels : Shader::kFeatures),
+      STD_TORCH_CHECK(args.features == (by_other ? args.other_width : Shader::kFeatures),
                       "gvtorch: features is not what the shader gives");
     });
     STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold ", kParameters, " elements, got ",
@@ -330,9 +344,9 @@ auto shade_rays(const ShadeRaysOp& a) {
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
   GV_SHADE(GV_CHECK_AND_SET)
   check_second_channel(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
-  args.other_channels = check_second_channel(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel,
-                                             Shaders::filtered(a.shader));
-  STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_channels,
+  args.other_width = check_second_channel(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel,
+                                          Shaders::filtered(a.shader));
+  STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_width,
                   "gvtorch: other_component out of range");
   args.other_bricks = a.other_bzyxc.has_value() ? static_cast<int32_t>(a.other_bzyxc->size(0)) : 0;
   STD_TORCH_CHECK(a.parameter_54.numel() <= INT32_MAX, "gvtorch: parameter_54 is too large");

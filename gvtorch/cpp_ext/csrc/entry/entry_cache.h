@@ -24,8 +24,7 @@ inline auto run(const CompactRequestsOp& a) {
   STD_TORCH_CHECK(a.capacity >= 1 && a.request_tn.numel() <= INT32_MAX, "gvtorch: no capacity, or too many nodes");
   Tensor node_k = make_output(args.node_k, a.request_tn, {a.capacity});
   Tensor word_k = make_output(args.word_k, a.request_tn, {a.capacity});
-  Tensor count_5 = torch::stable::new_zeros(a.request_tn, {5}, ScalarType::Long);
-  args.count_5 = to_kernel(count_5);
+  Tensor count_5 = make_zeros(args.count_5, a.request_tn, {5});
   compact(a.request_tn, a.request_tn.numel(), args);
   return std::make_tuple(node_k, word_k, count_5);
 }
@@ -35,18 +34,16 @@ GV_OP(ChooseRequestsOp, "choose_requests", GV_CHOOSE_REQUESTS, "(Tensor node_2b,
 inline auto run(const ChooseRequestsOp& a) {
   const Like like{a.asked_l2k};
   STD_TORCH_CHECK(a.asked_l2k.dim() == 3, "gvtorch: asked_l2k must be (l, 2, k)");
-  const int64_t lists = a.asked_l2k.size(0), listed = a.asked_l2k.size(2), tiles = a.loc_t4.numel() / 4;
   ChooseArgs args{};
+  args.lists = a.asked_l2k.size(0);
+  args.listed = a.asked_l2k.size(2);
+  args.tiles = a.loc_t4.numel() / 4;
   GV_CHOOSE_REQUESTS(GV_CHECK_AND_SET)
-  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && lists < 512 && lists * listed <= INT32_MAX,
+  const int64_t requests = args.lists * args.listed;
+  STD_TORCH_CHECK(a.batch >= 1 && a.per_tile >= 1 && args.lists < 512 && requests <= INT32_MAX,
                   "gvtorch: no batch, no nodes, or too many");
-  args.lists = lists;
-  args.listed = listed;
-  args.tiles = tiles;
-  const int64_t requests = lists * listed;
   const Tensor key_lk = make_output(args.key_lk, a.asked_l2k, {requests});
-  const Tensor counts = torch::stable::new_zeros(a.asked_l2k, {2 * requests + lists});
-  args.before_2lk = to_kernel(counts);
+  const Tensor counts = make_zeros(args.before_2lk, a.asked_l2k, {2 * requests + args.lists});
   args.end_l = args.before_2lk + 2 * requests;
   Tensor node_2b = make_output(args.node_2b, a.asked_l2k, {2, a.batch});
   Tensor priority_2b = make_output(args.priority_2b, a.asked_l2k, {2, a.batch});
@@ -65,16 +62,16 @@ GV_OP(LruPartitionOp, "lru_partition", GV_LRU_PARTITION, "(Tensor order_k, Tenso
 
 inline auto run(const LruPartitionOp& a) {
   const Like like{a.order_k};
-  const int64_t size = a.order_k.numel(), slots = a.stamp_s.numel();
+  const int64_t size = a.order_k.numel();
   UseArgs args{};
+  args.slots = a.stamp_s.numel();
   GV_LRU_PARTITION(GV_CHECK_AND_SET)
-  args.slots = slots;
   Tensor sorted_k = make_output(args.sorted_k, a.order_k, {size});
   Tensor unused_1 = make_output(args.unused_1, a.order_k, {1});
 #ifdef __CUDACC__
   compact(a.order_k, size, SplitByUse<true>{args});
 #else
-  const int64_t bytes = (slots + 7) / 8;
+  const int64_t bytes = (args.slots + 7) / 8;
   const Tensor used_s = make_output(args.used_s, a.order_k, {bytes});
   const Tensor used_k = make_output(args.used_k, a.order_k, {size});
   for_each(a.order_k, bytes, PackUse{args});
@@ -88,15 +85,12 @@ GV_OP(UnlinkOp, "unlink", GV_UNLINK, "()");
 
 inline void run(const UnlinkOp& a) {
   const Like like{a.pointer_tn};
-  const int64_t slots = a.owner_s.numel();
   UnlinkArgs args{};
-  GV_UNLINK(GV_CHECK_AND_SET)
   args.nodes = a.pointer_tn.numel();
-  args.slots = slots;
-  const Tensor leaving_s = torch::stable::new_zeros(a.pointer_tn, {slots}, ScalarType::Byte);
-  const Tensor any_shared = torch::stable::new_zeros(a.pointer_tn, {1});
-  args.leaving_s = to_kernel(leaving_s);
-  args.any_shared = to_kernel(any_shared);
+  args.slots = a.owner_s.numel();
+  GV_UNLINK(GV_CHECK_AND_SET)
+  const Tensor leaving_s = make_zeros(args.leaving_s, a.pointer_tn, {args.slots});
+  const Tensor any_shared = make_zeros(args.any_shared, a.pointer_tn, {1});
   for_each(a.pointer_tn, a.slot_k.numel(), TakeFromOwner{args});
 #ifndef __CUDACC__
   if (*args.any_shared == 0) return;
@@ -122,11 +116,11 @@ GV_OP(LinkOp, "link", GV_LINK, "()");
 
 inline void run(const LinkOp& a) {
   const Like like{a.pointer_tn};
-  const int64_t nodes = a.pointer_tn.numel(), count = a.node_k.numel();
+  const int64_t count = a.node_k.numel();
   WritePointer args{};
+  args.nodes = a.pointer_tn.numel();
   GV_LINK(GV_CHECK_AND_SET)
   STD_TORCH_CHECK(a.kind == kLoad || a.kind == kSubdivide, "gvtorch: kind must be LOAD or SUBDIVIDE");
-  args.nodes = nodes;
   for_each(a.pointer_tn, count, args);
 }
 
@@ -134,11 +128,11 @@ GV_OP(LinkBricksOp, "link_bricks", GV_LINK_BRICKS, "()");
 
 inline void run(const LinkBricksOp& a) {
   const Like like{a.brick_tn};
-  const int64_t nodes = a.brick_tn.numel(), slots = a.owner_b.numel(), count = a.node_k.numel();
+  const int64_t count = a.node_k.numel();
   LinkBrick args{};
+  args.nodes = a.brick_tn.numel();
+  args.slots = a.owner_b.numel();
   GV_LINK_BRICKS(GV_CHECK_AND_SET)
-  args.nodes = nodes;
-  args.slots = slots;
   for_each(a.brick_tn, count, args);
 }
 
@@ -146,17 +140,15 @@ GV_OP(LinkTilesOp, "link_tiles", GV_LINK_TILES, "()");
 
 inline void run(const LinkTilesOp& a) {
   const Like like{a.child_tn};
-  const int64_t tiles = a.parent_t.numel(), rows = a.node_j.numel(), count = a.row_k.numel();
-  const int64_t per_tile = tiles > 0 ? a.child_tn.numel() / tiles : 0;
-  const int64_t width = rows > 0 ? a.child_jw.numel() / rows : 0;
+  const int64_t count = a.row_k.numel();
   LinkTile args{};
+  args.tiles = a.parent_t.numel();
+  args.rows = a.node_j.numel();
+  args.per_tile = args.tiles > 0 ? static_cast<int32_t>(a.child_tn.numel() / args.tiles) : 0;
+  args.width = args.rows > 0 ? static_cast<int32_t>(a.child_jw.numel() / args.rows) : 0;
   GV_LINK_TILES(GV_CHECK_AND_SET)
-  STD_TORCH_CHECK(width <= per_tile || rows == 0, "gvtorch: child_jw is wider than a tile");
-  args.tiles = tiles;
-  args.rows = rows;
-  args.per_tile = static_cast<int32_t>(per_tile);
-  args.width = static_cast<int32_t>(width);
-  for_each(a.child_tn, count * per_tile, args);
+  STD_TORCH_CHECK(args.width <= args.per_tile || args.rows == 0, "gvtorch: child_jw is wider than a tile");
+  for_each(a.child_tn, count * args.per_tile, args);
 }
 
 GV_OP(PutRowsOp, "put_rows", GV_PUT_ROWS, "()");

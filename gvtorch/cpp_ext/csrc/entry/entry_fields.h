@@ -11,33 +11,29 @@ GV_OP(OrbitBoundsOp, "orbit_bounds", GV_ORBIT_BOUNDS, "Tensor");
 
 void follow_points(const Tensor& like, const OrbitArgs& args);  // in cpu.cpp and in cuda.cu
 
-template <class T>
-void follow_balls(const Tensor& like, const OrbitBoundsArgs& args) {
-  with_step<T>(args.kind,
-               [&](auto* step) { for_each(like, args.balls, FollowBalls<T, std::decay_t<decltype(*step)>>{args}); });
-}
-
 inline auto run(const OrbitsOp& a) {
   const Like like{a.point_p3, a.point_p3.scalar_type()};
-  const int64_t points = a.point_p3.numel() / 3;
   OrbitArgs args{};
-  GV_ORBITS(GV_CHECK_AND_SET)
-  args.points = points;
+  args.points = a.point_p3.numel() / 3;
   args.in_float64 = is_float64(a.point_p3);  // raises for other dtypes
-  Tensor result_3p = make_output(args.result_3p, a.point_p3, {3, points});
+  GV_ORBITS(GV_CHECK_AND_SET)
+  Tensor result_3p = make_output(args.result_3p, a.point_p3, {3, args.points});
   follow_points(a.point_p3, args);
   return result_3p;
 }
 
 inline auto run(const OrbitBoundsOp& a) {
-  const bool in_float64 = is_float64(a.center_k3);
   const Like like{a.center_k3, a.center_k3.scalar_type()};
-  const int64_t balls = a.reach_k.numel();
   OrbitBoundsArgs args{};
+  args.balls = a.reach_k.numel();
   GV_ORBIT_BOUNDS(GV_CHECK_AND_SET)
-  args.balls = balls;
-  Tensor ends_2k = make_output(args.ends_2k, a.center_k3, {2, balls});
-  in_float64 ? follow_balls<double>(a.center_k3, args) : follow_balls<float>(a.center_k3, args);
+  Tensor ends_2k = make_output(args.ends_2k, a.center_k3, {2, args.balls});
+  with_real(a.center_k3, [&](auto real) {
+    using T = decltype(real);
+    with_step<T>(args.kind, [&](auto* step) {
+      for_each(a.center_k3, args.balls, FollowBalls<T, std::decay_t<decltype(*step)>>{args});
+    });
+  });
   return ends_2k;
 }
 

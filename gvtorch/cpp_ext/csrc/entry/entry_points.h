@@ -16,19 +16,17 @@ inline auto run(const SplatOp& a) {
   STD_TORCH_CHECK(a.value_nc.dim() == 2 && a.value_nc.size(1) >= 1 && a.value_nc.size(1) <= INT32_MAX,
                   "gvtorch: value_nc must be (n, c)");
   const Like like{a.edge_k3e};
-  const int64_t cubes = a.edge_k3e.size(0), side = a.edge_k3e.size(2) - 1;
-  const int64_t width = a.value_nc.size(1), narrow = a.value_nc.size(0), wide = a.radius_m.numel();
-  const int64_t narrow_runs = a.narrow_s2.numel() / 2, wide_runs = a.wide_t2.numel() / 2;
+  const int64_t side = a.edge_k3e.size(2) - 1;
   SplatArgs args{};
-  GV_SPLAT(GV_CHECK_AND_SET)
-  args.cubes = cubes;
+  args.cubes = a.edge_k3e.size(0);
   args.side = side;
-  args.width = width;
-  args.narrow = narrow;
-  args.narrow_runs = narrow_runs;
-  args.wide = wide;
-  args.wide_runs = wide_runs;
-  Tensor sum_kzyxc = make_output(args.sum_kzyxc, a.edge_k3e, {cubes, side, side, side, width});
+  args.width = a.value_nc.size(1);
+  args.narrow = a.value_nc.size(0);
+  args.narrow_runs = a.narrow_s2.numel() / 2;
+  args.wide = a.radius_m.numel();
+  args.wide_runs = a.wide_t2.numel() / 2;
+  GV_SPLAT(GV_CHECK_AND_SET)
+  Tensor sum_kzyxc = make_output(args.sum_kzyxc, a.edge_k3e, {args.cubes, side, side, side, args.width});
   splat_points(a.edge_k3e, args);
   return sum_kzyxc;
 }

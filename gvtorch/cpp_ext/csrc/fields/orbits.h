@@ -19,16 +19,8 @@ enum class StepKind : int32_t { kPower, kFold, kCount };
   X(Int, iterations, kAny)                             \
   X(Bool, julia, kAny)
 
-// Sizes in limits: points
-#define GV_ORBITS(X)             \
-  X(Reals, point_p3, 3 * points) \
-  GV_ORBIT(X)
-
-// Sizes in limits: balls
-#define GV_ORBIT_BOUNDS(X)       \
-  X(Reals, center_k3, 3 * balls) \
-  X(Reals, reach_k, balls)       \
-  GV_ORBIT(X)
+#define GV_ORBITS(X) X(Reals, point_p3, 3 * args.points) GV_ORBIT(X)
+#define GV_ORBIT_BOUNDS(X) X(Reals, center_k3, 3 * args.balls) X(Reals, reach_k, args.balls) GV_ORBIT(X)
 
 struct OrbitArgs {
   GV_ORBITS(GV_VIEW)
@@ -57,7 +49,7 @@ GV_HD T from_planes(const Vec3<T>& z) {
 }
 template <class T>
 GV_HD T number_of(double value) {
-  return splat<T>(static_cast<RealOf<T>>(value));
+  return broadcast<T>(static_cast<RealOf<T>>(value));
 }
 
 // Calls body(whether it is set) for each bit of n below its highest set one, from high to low.
@@ -178,7 +170,7 @@ struct FollowPoints {
     const auto* constants = static_cast<const Real*>(args.constant_3);
     Vec3<T> constant = z;
     for (int axis = 0; axis < 3; ++axis) {
-      if (args.julia) constant[axis] = splat<T>(constants[axis]);
+      if (args.julia) constant[axis] = broadcast<T>(constants[axis]);
     }
     const Step step(args.amount);
     T radius = square_root(squared(z)), separation = number_of<T>(1), least_radius = radius, plane = from_planes(z);

@@ -20,18 +20,18 @@ constexpr double kParts = 1 << 30;  // of a voxel: volumes are summed as whole p
 constexpr int32_t kCorners = 16;    // of a clipped triangle, at most
 constexpr double kCoarse = 2;       // voxel size, in triangle sizes (`detail`), above which voxels descend alone
 
-// Sizes in limits: triangles, boxes, cubes
-#define GV_VOXELIZE(X)                \
-  X(World, corner_f33, 9 * triangles) \
-  X(Flags, solid_f, triangles)        \
-  X(World, box_n6, 6 * boxes)         \
-  X(World, low_k3, 3 * cubes)         \
-  X(World, size_k3, 3 * cubes)        \
-  X(Int, side, kMaxCubeSide + 1)      \
-  X(Float, thickness, kAny)           \
-  X(Float, detail, kAny)              \
-  X(Bool, shares, kAny)               \
-  X(Bool, weights, kAny)              \
+// Sizes in limits: boxes
+#define GV_VOXELIZE(X)                     \
+  X(World, corner_f33, 9 * args.triangles) \
+  X(Flags, solid_f, args.triangles)        \
+  X(World, box_n6, 6 * boxes)              \
+  X(World, low_k3, 3 * args.cubes)         \
+  X(World, size_k3, 3 * args.cubes)        \
+  X(Int, side, kMaxCubeSide + 1)           \
+  X(Float, thickness, kAny)                \
+  X(Float, detail, kAny)                   \
+  X(Bool, shares, kAny)                    \
+  X(Bool, weights, kAny)                   \
   X(Bool, wide, kAny)
 
 // The kernels' arguments: boxes of floor i begin at first[i]; those of floor 0 are the triangles'.
@@ -252,7 +252,7 @@ GV_HD T box_share(Vec3<T> normal, T offset) {
     share = sum / (six > 0 ? six : static_cast<T>(1));
   }
   share = full > static_cast<T>(0.5) ? 1 - share : share;
-  return clamp(share, static_cast<T>(0), static_cast<T>(1));
+  return saturate(share);
 }
 
 // A stack of the boxes that are still to be visited.

@@ -11,17 +11,17 @@ namespace gvtorch {
 
 enum class NoiseKind : int32_t { kPerlin, kValue, kSimplex, kNearest, kSecond, kApart, kCount };
 
-// Sizes in limits: points, axes. Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise.
-#define GV_NOISE(X)                \
-  X(Reals, point_pn, axes* points) \
-  X(Int, kind, kNoiseKinds)        \
-  X(Count, salt_x, kAny)           \
-  X(Count, salt_y, kAny)           \
-  X(Count, salt_z, kAny)           \
-  X(Int, period_x, kAny)           \
-  X(Int, period_y, kAny)           \
-  X(Int, period_z, kAny)           \
-  X(Float, jitter, kAny)           \
+// Sizes in limits: points. Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise.
+#define GV_NOISE(X)                     \
+  X(Reals, point_pn, args.axes* points) \
+  X(Int, kind, kNoiseKinds)             \
+  X(Count, salt_x, kAny)                \
+  X(Count, salt_y, kAny)                \
+  X(Count, salt_z, kAny)                \
+  X(Int, period_x, kAny)                \
+  X(Int, period_y, kAny)                \
+  X(Int, period_z, kAny)                \
+  X(Float, jitter, kAny)                \
   X(Int, reach, 3)
 
 constexpr int64_t kNoiseKinds = static_cast<int64_t>(NoiseKind::kCount);
@@ -88,10 +88,7 @@ struct NoiseAt {
   // --- Gradients
 
   // A gradient of two components of 1 or -1 and one of 0, chosen by `bits`.
-  struct Slope {
-    T x, y, z;
-  };
-  static GV_HD Slope slope(UInt bits) {
+  static GV_HD Vec3<T> slope(UInt bits) {
     const UInt third = shifted(bits, 8);
     const UInt is_x = ~shifted(third + kThird, 31), is_z = ~shifted(kThird - third, 31);
     const UInt first = ((bits << 25) & kTopBit) | kOneBits, second = ((bits << 24) & kTopBit) | kOneBits;
@@ -99,7 +96,7 @@ struct NoiseAt {
     return {from_bits(x), from_bits((first ^ x) | (second ^ z)), from_bits(z)};
   }
   static GV_HD T ramp(UInt bits, const T* away) {
-    const Slope gradient = slope(bits);
+    const Vec3<T> gradient = slope(bits);
     const T total = gradient.x * away[0] + gradient.y * away[1];
     if constexpr (N == 2) return total;
     if constexpr (N == 3) return total + gradient.z * away[2];
@@ -259,27 +256,16 @@ struct NoiseAt {
   }
 };
 
-// Calls body(kind, axes), both as compile-time constants.
-template <class Body>
+// Calls body(kind, axes), both as compile-time constants; the kind is kFirst or one of those after it.
+template <NoiseKind kFirst = NoiseKind::kPerlin, class Body>
 void with_noise(const NoiseArgs& args, const Body& body) {
-  const auto with_axes = [&](auto kind) {
-    if (args.axes == 2) return body(kind, std::integral_constant<int, 2>{});
-    return body(kind, std::integral_constant<int, 3>{});
-  };
-  switch (static_cast<NoiseKind>(args.kind)) {
-    case NoiseKind::kPerlin:
-      return with_axes(std::integral_constant<NoiseKind, NoiseKind::kPerlin>{});
-    case NoiseKind::kValue:
-      return with_axes(std::integral_constant<NoiseKind, NoiseKind::kValue>{});
-    case NoiseKind::kSimplex:
-      return with_axes(std::integral_constant<NoiseKind, NoiseKind::kSimplex>{});
-    case NoiseKind::kNearest:
-      return with_axes(std::integral_constant<NoiseKind, NoiseKind::kNearest>{});
-    case NoiseKind::kSecond:
-      return with_axes(std::integral_constant<NoiseKind, NoiseKind::kSecond>{});
-    default:
-      return with_axes(std::integral_constant<NoiseKind, NoiseKind::kApart>{});
+  constexpr auto kNext = static_cast<NoiseKind>(static_cast<int32_t>(kFirst) + 1);
+  if constexpr (kNext != NoiseKind::kCount) {
+    if (args.kind != static_cast<int32_t>(kFirst)) return with_noise<kNext>(args, body);
   }
+  const std::integral_constant<NoiseKind, kFirst> kind{};
+  if (args.axes == 2) return body(kind, std::integral_constant<int, 2>{});
+  body(kind, std::integral_constant<int, 3>{});
 }
 
 // An index is a point.

@@ -24,12 +24,12 @@ struct PacketBrick {
 
 // A channel of the brick pool.
 struct PacketPool {
-  const void* first;  // the number to read, in the pool's first voxel
-  int64_t stride;     // bytes of a brick
-  int32_t side, channels;
+  const void* first;    // the number to read, in the pool's first voxel
+  int64_t stride;       // bytes of a brick
+  int32_t side, width;  // width: numbers per voxel
 
-  PacketPool(const void* bricks, VoxelType type, int32_t side, int32_t channels, int32_t component)
-      : stride(brick_bytes(type, side, channels)), side(side), channels(channels) {
+  PacketPool(const void* bricks, VoxelType type, int32_t side, int32_t width, int32_t component)
+      : stride(brick_bytes(type, side, width)), side(side), width(width) {
     with_voxel(type, [&](auto voxel) { first = static_cast<const decltype(voxel)*>(bricks) + component; });
   }
   // True if offsets in the pool need 64 bits.
@@ -48,26 +48,30 @@ GV_HD Ints load_words(const PacketPool& pool, Ints brick, Ints offset) {
   return words;
 }
 
+// Offset of the lowest of eight voxels in a brick, whose voxels are step_x, step_y and step_z apart.
+GV_HD Ints offset_of(const EightVoxels<Floats>& corners, int32_t step_x, int32_t step_y, int32_t step_z) {
+  return truncated(corners.cell[2] * static_cast<float>(step_z) + corners.cell[1] * static_cast<float>(step_y) +
+                   corners.cell[0] * static_cast<float>(step_x));
+}
+
 // Trilinear interpolation. `brick` is the brick's first byte in the pool or, with kLongOffsets, its slot, for 64-bit
 // offsets.
 template <class Voxel, bool kLongOffsets>
 GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& position) {
   constexpr int32_t kBytes = sizeof(Voxel);
-  const int32_t step_x = pool.channels * kBytes;
+  const int32_t step_x = pool.width * kBytes;
   const int32_t step_y = step_x * pool.side;
   const int32_t step_z = step_y * pool.side;
   const EightVoxels<Floats> corners(position, pool.side);
-  const Ints corner =
-      truncated(corners.cell[2] * static_cast<float>(step_z) + corners.cell[1] * static_cast<float>(step_y) +
-                corners.cell[0] * static_cast<float>(step_x));
+  const Ints corner = offset_of(corners, step_x, step_y, step_z);
   return corners.blend([&](int y, int z, Floats& left, Floats& right) {
     const Ints first = corner + (z * step_z + y * step_y);
     const Ints word = load_words<kLongOffsets>(pool, brick, first);
-    left = Unpack<Voxel>::low(word);
+    left = unpack<Voxel>(word);
     if (kBytes <= 2 && step_x == kBytes) {  // one load serves both
-      right = Unpack<Voxel>::low((word >> (8 * kBytes % 32)) & ((1 << (8 * kBytes % 32)) - 1));
+      right = unpack<Voxel>((word >> (8 * kBytes % 32)) & ((1 << (8 * kBytes % 32)) - 1));
     } else {
-      right = Unpack<Voxel>::low(load_words<kLongOffsets>(pool, brick, first + step_x));
+      right = unpack<Voxel>(load_words<kLongOffsets>(pool, brick, first + step_x));
     }
   });
 }
@@ -76,7 +80,7 @@ GV_HD Floats trilinear(const PacketPool& pool, Ints brick, const Vec3<Floats>& p
 template <class Voxel>
 GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask mask, Ints brick, Floats x, Floats y,
                                      Floats z) {
-  const int64_t step_x = pool.channels * static_cast<int64_t>(sizeof(Voxel));
+  const int64_t step_x = pool.width * static_cast<int64_t>(sizeof(Voxel));
   const int64_t step_y = step_x * pool.side, step_z = step_y * pool.side;
   const EightVoxels<Floats> corners(Vec3<Floats>{x, y, z}, pool.side);
   const Ints cell =
@@ -105,11 +109,9 @@ template <class Voxel, bool kLongOffsets>
 GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> components, int32_t count, Ints brick,
                                  Floats x, Floats y, Floats z, Floats* out) {
   constexpr int32_t kBytes = sizeof(Voxel);
-  const int32_t step_x = pool.channels * kBytes, step_y = step_x * pool.side, step_z = step_y * pool.side;
+  const int32_t step_x = pool.width * kBytes, step_y = step_x * pool.side, step_z = step_y * pool.side;
   const EightVoxels<Floats> corners(Vec3<Floats>{x, y, z}, pool.side);
-  const Ints corner =
-      truncated(corners.cell[2] * static_cast<float>(step_z) + corners.cell[1] * static_cast<float>(step_y) +
-                corners.cell[0] * static_cast<float>(step_x));
+  const Ints corner = offset_of(corners, step_x, step_y, step_z);
   const Ints slot = kLongOffsets ? brick : brick * static_cast<int32_t>(pool.stride);
   Ints words[8]{};
   int32_t loaded = -1;  // offset of the loaded words in the voxel, bytes
@@ -125,8 +127,8 @@ GV_CALL void read_packet_numbers(const PacketPool& pool, Components<float> compo
       loaded = word_offset;
     }
     out[i] = corners.blend([&](int y, int z, Floats& left, Floats& right) {
-      left = Unpack<Voxel>::low(words[2 * y + 4 * z] >> shift);
-      right = Unpack<Voxel>::low(words[1 + 2 * y + 4 * z] >> shift);
+      left = unpack<Voxel>(words[2 * y + 4 * z] >> shift);
+      right = unpack<Voxel>(words[1 + 2 * y + 4 * z] >> shift);
     });
   }
 }

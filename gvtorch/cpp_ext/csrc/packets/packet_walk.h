@@ -15,18 +15,8 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-// Copies one lane out of a struct of all lanes, and back.
-template <class Lane, class Lanes>
-GV_HD Lane take_lane(const Lanes& lanes, int lane) {
-  Lane result;
-  Lanes::each_member(lanes, result, [&](const auto& member, auto& out) { out = lane_of(member, lane); });
-  return result;
-}
-template <class Lanes, class Lane>
-GV_HD void put_lane(Lanes& lanes, int lane, const Lane& lane_struct) {
-  Lanes::each_member(lanes, lane_struct, [&](auto& member, const auto& in) { set_lane(member, lane, in); });
-}
-// The same for Sums. UserSums, which keeps a Sum for each lane, has overloads, see user_shader.h.
+// A lane's Sum of those of all lanes, and back. UserSums, which keeps a Sum for each lane, has overloads, see
+// user_shader.h.
 template <class Sum, class Sums>
 GV_HD Sum sum_of(const Sums& sums, int lane) {
   return take_lane<Sum>(sums, lane);
@@ -152,7 +142,7 @@ struct PacketWalk {
   GV_HD Vec3<Floats> differences(const PacketBrick& brick, Floats t) const {
     return differences(brick, depth_of(brick), t);
   }
-  GV_HD Floats weight(Floats t) const { return clamp((intervals.cone(t) - voxel) * blend_scale, 0.0f, 1.0f); }
+  GV_HD Floats weight(Floats t) const { return saturate((intervals.cone(t) - voxel) * blend_scale); }
 
   template <class Numbers>
   GV_HD Numbers between(const Numbers& finer, const Numbers& coarser, Floats t) const {
@@ -190,9 +180,9 @@ struct PacketWalk {
     fine = coarse = PacketBrick{};
     ray = Ray<Floats>{};
     intervals = Intervals<Floats>{};
-    intervals.step = walk.options.step;
+    intervals.step = walk.step;
     intervals.top = kernel.lengths - 1;
-    intervals.length = splat<Floats>(intervals.step);
+    intervals.length = broadcast<Floats>(intervals.step);
     intervals.inverse_length = 1.0f / intervals.length;
     for (int axis = 0; axis < 3; ++axis) ray.upper_bound[axis] = Ray<Floats>::upper_bound_of(walk.rays, axis);
     for (int lane = 0; lane < kLanes; ++lane) {

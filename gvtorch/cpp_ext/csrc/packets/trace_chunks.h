@@ -11,13 +11,14 @@ namespace gvtorch {
 // and load 4 bytes at once: beyond a voxel, but not beyond the pool, whose last brick only single rays' functions read.
 inline bool packets_can_trace(const TraceArgs& args) {
   constexpr int64_t kMaxAddressed = INT32_MAX / sizeof(int32_t);
-  return args.nodes <= kMaxAddressed && args.bricks >= 2 && brick_bytes(args.voxel, args.side, args.channels) < 1 << 24;
+  return args.nodes <= kMaxAddressed && args.bricks >= 2 &&
+         brick_bytes(args.voxel, args.side, args.voxel_width) < 1 << 24;
 }
 
 // True if packets can trace a fused shader's rays.
 inline bool packets_can_shade(const ShadeArgs& args) {
-  const auto fits = [&](VoxelType type, int32_t channels) { return brick_bytes(type, args.side, channels) < 1 << 24; };
-  if (!packets_can_trace(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_channels))
+  const auto fits = [&](VoxelType type, int32_t width) { return brick_bytes(type, args.side, width) < 1 << 24; };
+  if (!packets_can_trace(args) || !fits(args.normal_voxel, 3) || !fits(args.other_voxel, args.other_width))
     return false;
   return with_shader<float>(args.shader, [&](auto type) {
     using Type = decltype(type);

@@ -11,20 +11,19 @@ namespace gvtorch {
 constexpr int64_t kMaxSplatSide = 1 << 20;  // voxels along a side of a cube
 constexpr double kSmallest = 0x1p-1000;     // smallest radius to divide by: SMALLEST of the twin
 
-// Sizes in limits: cubes, side, width; rows and runs of rows of narrow and of wide points. The list of cube k is the
-// runs narrow_b[k] to narrow_b[k + 1], and wide_b[k] to wide_b[k + 1].
-#define GV_SPLAT(X)                          \
-  X(World, edge_k3e, 3 * cubes * (side + 1)) \
-  X(Longs, low_k3, 3 * cubes)                \
-  X(Longs, narrow_b, cubes + 1)              \
-  X(Longs, narrow_s2, 2 * narrow_runs)       \
-  X(Longs, voxel_n3, 3 * narrow)             \
-  X(World, value_nc, narrow* width)          \
-  X(Longs, wide_b, cubes + 1)                \
-  X(Longs, wide_t2, 2 * wide_runs)           \
-  X(World, center_m3, 3 * wide)              \
-  X(World, radius_m, wide)                   \
-  X(World, value_mc, wide* width)
+// The list of cube k is the runs of rows narrow_b[k] to narrow_b[k + 1], and wide_b[k] to wide_b[k + 1].
+#define GV_SPLAT(X)                                    \
+  X(World, edge_k3e, 3 * args.cubes * (args.side + 1)) \
+  X(Longs, low_k3, 3 * args.cubes)                     \
+  X(Longs, narrow_b, args.cubes + 1)                   \
+  X(Longs, narrow_s2, 2 * args.narrow_runs)            \
+  X(Longs, voxel_n3, 3 * args.narrow)                  \
+  X(World, value_nc, args.narrow* args.width)          \
+  X(Longs, wide_b, args.cubes + 1)                     \
+  X(Longs, wide_t2, 2 * args.wide_runs)                \
+  X(World, center_m3, 3 * args.wide)                   \
+  X(World, radius_m, args.wide)                        \
+  X(World, value_mc, args.wide* args.width)
 
 struct SplatArgs {
   GV_SPLAT(GV_VIEW)
@@ -33,14 +32,6 @@ struct SplatArgs {
 };
 
 inline namespace GV_NAMESPACE {
-
-// A range of indices, clamped to [0, count] whatever `ends` holds.
-struct Span {
-  int64_t begin, end;
-
-  GV_HD Span(const int64_t* ends, int64_t count)
-      : begin(clamp<int64_t>(ends[0], 0, count)), end(clamp<int64_t>(ends[1], 0, count)) {}
-};
 
 // Calls body(row) for the rows of a cube's list.
 template <class Body>
@@ -147,7 +138,7 @@ struct Shares {
       if (filled == kStep) {
         memcpy(&edges, edge + first, sizeof(edges));
       } else {
-        edges = splat<Doubles>(edge[count]);
+        edges = broadcast<Doubles>(edge[count]);
         for (int64_t lane = 0; lane < filled; ++lane) edges[lane] = edge[first + lane];
       }
       edges = Spread::below(point.away(edges));
@@ -172,11 +163,11 @@ struct SplatPart {
   // A row of the cube has all numbers of its first voxel, then those of the next, and so on.
   void operator()(int64_t index) const {
     const int64_t side = args.side, width = args.width, row_size = side * width;
-    const int64_t x0 = index % along_x() * kPartX, x1 = minimum(x0 + kPartX, row_size);
+    const int64_t x0 = index % along_x() * kPartX, x1 = smaller(x0 + kPartX, row_size);
     index /= along_x();
-    const int64_t y0 = index % along_y() * kPartY, y1 = minimum(y0 + kPartY, side);
+    const int64_t y0 = index % along_y() * kPartY, y1 = smaller(y0 + kPartY, side);
     index /= along_y();
-    const int64_t z0 = index % along_z() * kPartZ, z1 = minimum(z0 + kPartZ, side), cube = index / along_z();
+    const int64_t z0 = index % along_z() * kPartZ, z1 = smaller(z0 + kPartZ, side), cube = index / along_z();
     double* sum = args.sum_kzyxc + cube * side * side * row_size;
     for (int64_t z = z0; z < z1; ++z) {
       for (int64_t y = y0; y < y1; ++y) {
@@ -217,7 +208,7 @@ struct SplatPart {
       x.fill({center[0], radius}, edge_x, voxels);
       if (z.begin == z.end || y.begin == y.end || x.begin == x.end) return;
       const double* value = args.value_mc + row * width;
-      const int64_t begin = maximum((first + x.begin) * width, x0), end = minimum((first + x.end) * width, x1);
+      const int64_t begin = larger((first + x.begin) * width, x0), end = smaller((first + x.end) * width, x1);
       int64_t voxel = begin / width - first, c = begin % width;
       for (int64_t i = begin; i < end; ++i) {
         line[i - begin] = x.share[voxel] * value[c];
@@ -232,9 +223,6 @@ struct SplatPart {
       }
     });
   }
-
-  static int64_t minimum(int64_t a, int64_t b) { return b < a ? b : a; }
-  static int64_t maximum(int64_t a, int64_t b) { return b > a ? b : a; }
 };
 #endif
 

@@ -48,7 +48,7 @@ template <class T>
 struct ChannelMix : ShaderFacts {
   static constexpr bool kReadsAll = true;
   static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
-    return int64_t{args.levels} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
+    return int64_t{args.lengths} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
   using SumOf = ShadeSum<V>;
@@ -61,7 +61,7 @@ struct ChannelMix : ShaderFacts {
   ChannelRows<T> cached_rows[kMaxNumbers];  // read once; on a GPU, rows are read where they are needed
 #endif
 
-  explicit ChannelMix(const ShadeArgs& args) : view(args), step(static_cast<T>(args.step)), width(args.channels) {
+  explicit ChannelMix(const ShadeArgs& args) : view(args), step(static_cast<T>(args.step)), width(args.voxel_width) {
 #ifndef __CUDACC__
     read([&](int32_t i, const ChannelRows<T>& rows) {
       cached_rows[i] = rows;
@@ -100,8 +100,7 @@ struct ChannelMix : ShaderFacts {
     V halvings = total;
     if (piece.odd) halvings = total * (piece.length / step);
     const V alpha = absorbed_by(halvings), scale = alpha / total;
-    sum.add_light({red * scale, green * scale, blue * scale, alpha}, sum.clear, shown);
-    sum.absorb(alpha, piece.start, piece.length, sum.hit_clear, shown);
+    sum.add_premultiplied({red * scale, green * scale, blue * scale, alpha}, piece, shown);
   }
   GV_HD void done(Sum&) const {}
 

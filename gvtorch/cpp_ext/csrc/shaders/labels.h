@@ -51,23 +51,18 @@ struct Labels : ShaderFacts {
     Row<V> row{};
     Vec3<V> normal{};
     probe.each_lane(mask, [&](int lane, const auto& lane_probe) {
-      const Contribution contribution = blended(lane_of(piece.middle, lane), lane_of(piece.length, lane),
-                                                lane_of(piece.level, lane), piece.odd, lane_probe);
+      const Contribution contribution = blended(take_lane<Piece<T>>(piece, lane), lane_probe);
       const T clear = lane_of(sum.clear, lane), clear_after = clear * (1 - contribution.row.alpha);
       if (clear_after < sum.hit_clear && clear >= sum.hit_clear) {
         lane_of(sum.feature_c, lane)[0] = static_cast<T>(1 + contribution.label);
       }
-      set_lane(row.red, lane, contribution.row.red);
-      set_lane(row.green, lane, contribution.row.green);
-      set_lane(row.blue, lane, contribution.row.blue);
-      set_lane(row.alpha, lane, contribution.row.alpha);
+      put_lane(row, lane, contribution.row);
       for (int axis = 0; axis < 3; ++axis) set_lane(normal[axis], lane, contribution.normal[axis]);
     });
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
     sum.add_normal(normal, sum.clear, shown);
-    sum.add_light(row, sum.clear, shown);
-    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, shown);
+    sum.add_premultiplied(row, piece, shown);
   }
   GV_HD void done(Sum&) const {}
 
@@ -76,27 +71,24 @@ struct Labels : ShaderFacts {
     return static_cast<int32_t>(clamp(label - table.low, static_cast<T>(0), table.last));
   }
   // Blends both nodes; the label is the finer node's, or the coarser one's where the finer node shows nothing.
-  GV_HD Contribution blended(T t, T length, int32_t level, bool odd, const Probe<T>& probe) const {
+  GV_HD Contribution blended(const Piece<T>& piece, const Probe<T>& probe) const {
     Contribution result;
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+    GV_NO_UNROLL
     for (int node = 0; node <= static_cast<int>(probe.mixed); ++node) {
-      const Contribution contribution =
-          contribution_of(t, length, level, odd, probe, node == 0 ? probe.fine : probe.coarse);
+      const Contribution contribution = contribution_of(piece, probe, node == 0 ? probe.fine : probe.coarse);
       if (node == 0) {
         result = contribution;
         continue;
       }
       if (!(result.row.alpha > 0)) result.label = contribution.label;
-      result.row = probe.between(result.row, contribution.row, t);
-      result.normal = probe.between(result.normal, contribution.normal, t);
+      result.row = probe.between(result.row, contribution.row, piece.middle);
+      result.normal = probe.between(result.normal, contribution.normal, piece.middle);
     }
     return result;
   }
-  GV_HD Contribution contribution_of(T t, T length, int32_t level, bool odd, const Probe<T>& probe,
-                                     const Spot<T>& spot) const {
+  GV_HD Contribution contribution_of(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
     const Transfer<T> table(transfer);
+    const T t = piece.middle;
     Contribution result;
     int32_t cell[3] = {0, 0, 0};
     T from_center[3] = {0, 0, 0}, label;
@@ -107,9 +99,9 @@ struct Labels : ShaderFacts {
       label = probe.value_in(spot, cell[0], cell[1], cell[2]);
     }
     result.label = row_of(table, label);
-    Row<T> row = load_row(&table.table_lm[(odd ? 0 : level) * table.rows + result.label]);
+    Row<T> row = load_row(&table.table_lm[(piece.odd ? 0 : piece.level) * table.rows + result.label]);
     if (!(row.alpha > 0)) return result;
-    if (odd) row.alpha = stretch(row.alpha, length / step);
+    if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
     if (own_numbers<Numbers>(light.parameters).lit > 0) {
       if (spot.brick >= 0) result.normal = normal(probe, spot, cell, from_center, label);
       row = light.shade(row, result.normal, probe, t);
@@ -144,14 +136,10 @@ struct Labels : ShaderFacts {
     }
     const auto clamped_cell = [&](int axis, int k) { return smaller(larger(cell[axis] + k - reach, 0), last); };
     Vec3<T> n{0, 0, 0};
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+    GV_NO_UNROLL
     for (int k = 0; k <= 2 * reach; ++k) {
       T plane = 0, along_x = 0, along_y = 0;
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+      GV_NO_UNROLL
       for (int j = 0; j <= 2 * reach; ++j) {
         T row = 0, along = 0;
         for (int i = 0; i <= 2 * reach; ++i) {

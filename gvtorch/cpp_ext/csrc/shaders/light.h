@@ -1,5 +1,5 @@
-// What the fused shaders share: Piece, an interval of a ray or of each ray of a packet; ShadeSum, a shader's sums; and
-// Light, the lighting of a position. T is float, double or Floats (arithmetic.h).
+// What the fused shaders share: `look_up`, the transfer function over an interval, and Light, the lighting of a
+// position. T is float, double or Floats (arithmetic.h).
 //
 // Sources: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977; Wrenninge, Kulla,
 // Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey, Greenstein, "Diffuse radiation in the
@@ -11,43 +11,6 @@
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
-
-template <class T>
-struct Piece {
-  T start, end, length, middle;  // distances, world units
-  IntOf<T> level{};              // the length is step * 2^level, unless `odd`
-  T value;                       // in the middle
-  T front, back;                 // values at both ends, for shaders with kEnds
-  bool odd = false;              // of any length, with level 0
-};
-
-template <class T>
-struct ShadeSum : Accumulator<T> {
-  using Base = Accumulator<T>;
-  using typename Base::Mask;
-  using typename Base::Real;
-  Vec3<T> normal{};                        // towards the eye, weighted by share
-  Real hit_clear;                          // transmittance at which depth is recorded
-  typename LanesOf<T>::Pointer feature_c;  // of each lane
-
-  GV_HD void add_normal(Vec3<T> n, T share, Mask mask = all_lanes<T>()) {
-    for (int axis = 0; axis < 3; ++axis) normal[axis] = select(mask, normal[axis] + share * n[axis], normal[axis]);
-  }
-
-  // Begins a new ray in a lane.
-  GV_HD void begin(int lane, Real clear, Real hit_clear, Real* feature_c) {
-    set_lane(this->clear, lane, clear);
-    this->hit_clear = hit_clear;
-    set_lane(this->feature_c, lane, feature_c);
-  }
-  template <class A, class B, class Body>
-  GV_HD static void each_member(A& a, B& b, const Body& body) {
-    Base::each_member(a, b, body);
-    body(a.normal, b.normal);
-    body(a.hit_clear, b.hit_clear);
-    body(a.feature_c, b.feature_c);
-  }
-};
 
 // The transfer function's colour of a value, and its alpha over an interval of any length.
 template <class T, class V>
@@ -141,9 +104,9 @@ struct Light {
   GV_HD LightCone<V> towards(const AnyProbe& probe, typename AnyProbe::Number t) const {
     const Parameters<T>& p = *parameters;
     const Vec3<V> d = probe.sight.direction;
-    LightCone<V> cone{{-d.x, -d.y, -d.z}, splat<V>(static_cast<T>(INFINITY)), splat<V>(p.light_width)};
+    LightCone<V> cone{{-d.x, -d.y, -d.z}, broadcast<V>(static_cast<T>(INFINITY)), broadcast<V>(p.light_width)};
     if (kind() == LightKind::kDirectional) {
-      for (int axis = 0; axis < 3; ++axis) cone.direction[axis] = splat<V>(-p.light_vector[axis]);
+      for (int axis = 0; axis < 3; ++axis) cone.direction[axis] = broadcast<V>(-p.light_vector[axis]);
       cone.direction = unit(cone.direction);
     }
     if (kind() == LightKind::kPoint) {
@@ -163,7 +126,7 @@ struct Light {
     const Parameters<T>& p = *parameters;
     const Vec3<V> d = probe.sight.direction;
     const auto [to_light, length, growth] = towards(probe, t);
-    V facing = splat<V>(static_cast<T>(1)), highlight{};
+    V facing = broadcast<V>(static_cast<T>(1)), highlight{};
     const MaskOf<V> has_normal = dot(n, n) > 0;
     if (any(has_normal)) {
       facing = select(has_normal, larger(V{}, dot(n, to_light)), facing);
@@ -206,7 +169,7 @@ struct Light {
                            V t, Vec3<V>& normal) const {
     const T zero = 0, one = 1, two = 2, three = 3, shininess = parameters->shininess;
     const Vec3<V> d = probe.sight.direction;
-    const V total = m.trace(), unity = splat<V>(one);
+    const V total = m.trace(), unity = broadcast<V>(one);
     const V share = clamp(static_cast<T>(kFaint) * total, zero, one), divisor = select(total > 0, total, unity);
     m = {m.xx / divisor, m.xy / divisor, m.xz / divisor, m.yy / divisor, m.yz / divisor, m.zz / divisor};
     const V square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + two * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);

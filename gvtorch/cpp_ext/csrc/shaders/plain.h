@@ -12,6 +12,8 @@ inline namespace GV_NAMESPACE {
 struct ShaderFacts {
   static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
   static constexpr bool kReadsAll = false;
+  static constexpr bool kShort = false;       // `add` is short: its loop may be compiled several times
+  static constexpr bool kToLight = false;     // it follows rays to a light, see Veil
   static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
   static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
   static constexpr int32_t kFiltered = 0;     // above 0: numbers that a voxel of its second channel has, once or for
@@ -24,6 +26,7 @@ struct ShaderFacts {
 // The plain transfer function. Table: TransferTable or Transfer.
 template <class T, class Table = TransferTable<T>>
 struct Plain : ShaderFacts {
+  static constexpr bool kShort = true;
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -41,7 +44,7 @@ struct Plain : ShaderFacts {
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
     const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
-    if (!all_transparent(mask, row.alpha)) sum.add(row, piece.start, piece.length, sum.hit_clear, mask);
+    if (!all_transparent(mask, row.alpha)) sum.add(row, piece, mask);
   }
   GV_HD void done(Sum&) const {}
 };

@@ -131,13 +131,7 @@ struct Sight {
     return {origin.x + distance * direction.x, origin.y + distance * direction.y, origin.z + distance * direction.z};
   }
 
-  // Calls body(a's member, b's member) for each member that differs between lanes.
-  template <class A, class B, class Body>
-  GV_HD static void each_member(A& a, B& b, const Body& body) {
-    body(a.origin, b.origin);
-    body(a.direction, b.direction);
-    body(a.moved, b.moved);
-  }
+  GV_EACH_MEMBER(GV_BOTH(origin) GV_BOTH(direction) GV_BOTH(moved))
 };
 
 struct Channels {
@@ -257,9 +251,7 @@ struct Probe {
   GV_HD Vec3<T> differences(const Spot<T>& spot, T t) const {
     Vec3<T> slope{0, 0, 0};
     if (spot.brick < 0) return slope;
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+    GV_NO_UNROLL
     for (int axis = 0; axis < 3; ++axis) {
       slope[axis] = difference(
           spot, t, axis, [&](Vec3<T> position) { return read(channels.value, channels.component, spot, position); });
@@ -279,9 +271,7 @@ struct Probe {
     return read_number<T>(channel.bricks_bzyxc, channel.type,
                           first_of(channel, channels.component, spot) + voxel * channel.width);
   }
-  GV_HD T weight(T t) const {
-    return clamp((cone_near + cone_growth * t - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
-  }
+  GV_HD T weight(T t) const { return saturate((cone_near + cone_growth * t - voxel) * blend); }
 
   // Blends the two nodes' results at distance t, a number or several: the coarse one has `weight`.
   template <class Numbers>

@@ -3,29 +3,63 @@
 // sample needs is stored. SampleBricks then reads any channel at any sample, equal to the renderer in every bit;
 // CompositeRay composites.
 //
-// A segment is all the whole intervals of one visit that have one length and one base, or one piece of any length: the
-// last interval of a ray, cut at the far side, or a region of one value. Lists have exact sizes: rays are walked twice,
-// to count and to write. A ray may be walked in parts of `limit` samples and at least one visit, from `state_r3` on.
+// A segment is all the whole intervals of one visit that have one length and one base, or one odd interval: the last
+// one of a ray, cut at the far side, or a region of one value. Lists have exact sizes: rays are walked twice, to count
+// and to write. A ray may be walked in parts of `limit` samples and at least one visit, from `state_r3` on.
 #pragma once
 
 #include "shaders/shade_rays.h"
 #include "walk/brick.h"
 
 namespace gvtorch {
+
+// A part of a walk: it continues from state_r3, and pauses after `limit` samples. Sizes in limits: rays
+#define GV_PART(X)                  \
+  X(MaybeReals, state_r3, 3 * rays) \
+  X(Int, limit, kAny)               \
+  X(Bool, by_node, kAny)
+#define GV_SEGMENT_RANGE(X) X(Longs, first_r, rays) X(Count, total, kAny)
+
+// Segments, and samples of them. Sizes in limits: samples
+#define GV_SAMPLES(X)                      \
+  X(Words, ray_s, args.segments)           \
+  X(Words, node_s2, 2 * args.segments)     \
+  X(Words, brick_s2, 2 * args.segments)    \
+  X(Words, depth_s3, 3 * args.segments)    \
+  X(Words, interval_s3, 3 * args.segments) \
+  X(Reals, distance_s3, 3 * args.segments) \
+  X(Words, segment_k, samples)             \
+  X(Words, number_k, samples)
+#define GV_GRADIENT(X) X(Reals, grad_kc, samples* voxel_width)
+
+// Packed samples of rays: those of a ray are consecutive, from front to back. Sizes in limits: rays
+#define GV_PACKED(X)                           \
+  X(Reals, alpha_k, args.count)                \
+  X(Reals, feature_kc, args.count* args.width) \
+  X(Longs, offset_r, rays + 1)
+#define GV_COMPOSITE(X) GV_PACKED(X) X(Reals, clear_r, rays) X(Float, stop_clear, kAny)
+#define GV_COMPOSITE_BACKWARD(X)          \
+  X(Reals, grad_sum_rc, rays* args.width) \
+  X(Reals, grad_left_r, rays)             \
+  GV_PACKED(X)                            \
+  X(Reals, before_k, args.count)          \
+  X(Float, stop_clear, kAny)
+
 inline namespace GV_NAMESPACE {
 
-constexpr int32_t kPiece = -1;  // level of a piece
+constexpr int32_t kOdd = -1;  // level of an odd interval
 
 template <class T>
 struct Segment {
   Holder fine, coarse;
   int32_t wanted = 0;            // depth that the cone asked for
   int32_t first = 0, count = 0;  // number of the first interval, counted from base; how many intervals
-  int32_t level = kPiece;        // intervals are step * 2^level long, or kPiece
+  int32_t level = kOdd;          // intervals are step * 2^level long, or kOdd
   // Distances from where the ray enters the scene; lookup_t: where the nodes were looked up.
   T base = 0, start = 0, end = 0, lookup_t = 0;
 };
 
+// Where segments are written.
 template <class T>
 struct SegmentView {
   int32_t *ray_s, *node_s2, *brick_s2, *depth_s3, *interval_s3;
@@ -52,15 +86,18 @@ struct SegmentView {
 };
 
 // Walks a ray, and calls emit(segment) for what it samples.
+//
+//   state_r3    base, count and level from which each ray continues; null: rays begin
+//   limit       a ray pauses after the visit in which it reaches this many samples; 0: it goes to its end
+//   by_node     a visit of two nodes is never a region, even where their constants are equal
 template <class T, class Digits>
 struct WalkRay {
+  using Real = T;
   ShadeRay<T, Plain<T>, Digits> kernel;
-  const T* state_r3;  // base, count and level from which each ray continues; null: rays begin
-  int32_t limit;      // a ray pauses after the visit in which it reaches this many samples; 0: it goes to its end
-  bool by_node;       // a visit of two nodes is never a region, even where their constants are equal
+  GV_PART(GV_TYPED_VIEW)
 
   GV_HD Intervals<T> begin(const Ray<T>& ray, int64_t number) const {
-    Intervals<T> intervals(ray, kernel.options.step, kernel.lengths);
+    Intervals<T> intervals(ray, kernel.step, kernel.lengths);
     if (state_r3 == nullptr) return intervals;
     intervals.base = state_r3[3 * number];
     intervals.count = state_r3[3 * number + 1];
@@ -108,7 +145,7 @@ struct WalkRay {
       segment.end = end;
       segment.first = 0;
       segment.count = 1;
-      segment.level = kPiece;
+      segment.level = kOdd;
       finish(segment);
     }
     GV_HD int32_t take_intervals(Segment<T>& segment, const Intervals<T>& intervals, int32_t run_length, bool last) {
@@ -149,12 +186,12 @@ struct WalkRay {
   }
 };
 
-template <class T, class Walk>
+template <class Walk, class T = typename Walk::Real>
 struct CountSegments {
   Walk walk;
-  int32_t* count_r3;  // segments, samples, visits
-  T* state_r3;
-  bool* missed_r;
+  int32_t* count_r3 = nullptr;  // segments, samples, visits
+  T* state_r3 = nullptr;
+  bool* missed_r = nullptr;
 
   GV_HD void operator()(int64_t index) const {
     const int64_t ray_number = walk.kernel.order(index);
@@ -173,12 +210,12 @@ struct CountSegments {
   }
 };
 
-template <class T, class Walk>
+// first_r: where each ray's segments begin.
+template <class Walk, class T = typename Walk::Real>
 struct WriteSegments {
   Walk walk;
-  const int64_t* first_r;  // where each ray's segments begin
-  int64_t total;
-  SegmentView<T> out;
+  GV_SEGMENT_RANGE(GV_TYPED_VIEW)
+  SegmentView<T> out{};
 
   GV_HD void operator()(int64_t index) const {
     const int64_t ray_number = walk.kernel.order(index);
@@ -198,24 +235,18 @@ struct WriteSegments {
 template <class Voxel>
 struct BrickView {
   const Voxel *bricks_bzyxc, *constant_tnc;
-  int32_t side, border, channels;
+  int32_t side, border, width;  // width: numbers per voxel
 
-  GV_HD int64_t first_number(int32_t brick) const {
-    return static_cast<int64_t>(brick) * side * side * side * channels;
-  }
+  GV_HD int64_t first_number(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * width; }
 };
 
 // Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
 template <class T, class Voxel>
 struct FindSample {
-  RayView rays;
-  TreeView tree;  // only its shape
-  Levels<T> levels;
+  Walk<T> walk;  // only rays and the shape of the tree
   BrickView<Voxel> bricks;
-  SegmentView<T> segments;  // read only
-  const int32_t *segment_k, *number_k;
-  int64_t ray_count, segment_count, node_count, brick_count;
-  T step;
+  int64_t segments, nodes;
+  GV_SAMPLES(GV_TYPED_VIEW)
 
   struct SampleSource {
     Spot<T> fine, coarse;
@@ -226,43 +257,42 @@ struct FindSample {
   GV_HD SampleSource operator()(int64_t k) const {
     SampleSource source;
     const int64_t segment = segment_k[k];
-    if (segment < 0 || segment >= segment_count) return source;
-    const int32_t wanted = segments.depth_s3[3 * segment + 2];
-    const int64_t ray_number = segments.ray_s[segment];
+    if (segment < 0 || segment >= segments) return source;
+    const TreeView& tree = walk.tree;
+    const int32_t wanted = depth_s3[3 * segment + 2];
+    const int64_t ray_number = ray_s[segment];
     Holder holders[2];
     for (int i = 0; i < 2; ++i) {
       Holder& holder = holders[i];
-      holder = {segments.node_s2[2 * segment + i], segments.brick_s2[2 * segment + i],
-                segments.depth_s3[3 * segment + i]};
-      if (holder.node < 0 || holder.node >= node_count || holder.brick >= brick_count || holder.depth < 0 ||
+      holder = {node_s2[2 * segment + i], brick_s2[2 * segment + i], depth_s3[3 * segment + i]};
+      if (holder.node < 0 || holder.node >= nodes || holder.brick >= tree.bricks || holder.depth < 0 ||
           holder.depth > tree.max_depth)
         return source;
     }
-    if (ray_number < 0 || ray_number >= ray_count || wanted < 0 || wanted > tree.max_depth) return source;
+    if (ray_number < 0 || ray_number >= walk.order.rays || wanted < 0 || wanted > tree.max_depth) return source;
     source.valid = true;
-    const Ray<T> ray(rays, ray_number);
-    const Digits<T> digits(tree, levels, rays, ray, segments.distance_s3[3 * segment + 2]);
+    const Ray<T> ray(walk.rays, ray_number);
+    const Digits<T> digits(tree, walk.levels, walk.rays, ray, distance_s3[3 * segment + 2]);
     source.fine = source.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
     source.t = middle_of(segment, number_k[k]);
     source.weight = 0;
     if (holders[1].node != holders[0].node) {
       source.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
-      const T voxel = levels.voxel[wanted];
-      const T blend = 1 / ((wanted > 0 ? levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
+      const T voxel = walk.levels.voxel[wanted];
+      const T blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
       const T cone = ray.cone_near + ray.cone_growth * source.t;
-      source.weight = clamp((cone - voxel) * blend, static_cast<T>(0), static_cast<T>(1));
+      source.weight = saturate((cone - voxel) * blend);
     }
     return source;
   }
   // Distance of the middle of a segment's interval.
   GV_HD T middle_of(int64_t segment, int32_t number) const {
-    const int32_t level = segments.interval_s3[3 * segment + 2];
-    const T base = segments.distance_s3[3 * segment];
-    const T end = segments.distance_s3[3 * segment + 1];
+    const int32_t level = interval_s3[3 * segment + 2];
+    const T base = distance_s3[3 * segment], end = distance_s3[3 * segment + 1];
     if (level < 0) return base + (end - base) * static_cast<T>(0.5);
-    T length = step;
+    T length = walk.step;
     for (int32_t power = 0; power < smaller(level, kMaxLevels); ++power) length = length + length;
-    const int32_t count = segments.interval_s3[3 * segment] + number;
+    const int32_t count = interval_s3[3 * segment] + number;
     return base + (static_cast<T>(count) + static_cast<T>(0.5)) * length;
   }
 };
@@ -270,27 +300,26 @@ struct FindSample {
 template <class T, class Voxel>
 struct SampleBricks {
   FindSample<T, Voxel> find_sample;
-  T* value_kc;
+  T* value_kc = nullptr;
 
   GV_HD void operator()(int64_t k) const {
     const auto source = find_sample(k);
     const BrickView<Voxel>& bricks = find_sample.bricks;
     const bool mixed = source.coarse.node != source.fine.node;
-    for (int32_t channel = 0; channel < bricks.channels; ++channel) {
+    for (int32_t c = 0; c < bricks.width; ++c) {
       T value = 0;
       if (source.valid) {
-        value = read(source.fine, source.t, channel);
-        if (mixed) value = value + source.weight * (read(source.coarse, source.t, channel) - value);
+        value = read(source.fine, source.t, c);
+        if (mixed) value = value + source.weight * (read(source.coarse, source.t, c) - value);
       }
-      value_kc[k * bricks.channels + channel] = value;
+      value_kc[k * bricks.width + c] = value;
     }
   }
-  GV_HD T read(const Spot<T>& spot, T t, int32_t channel) const {
+  GV_HD T read(const Spot<T>& spot, T t, int32_t c) const {
     const BrickView<Voxel>& bricks = find_sample.bricks;
-    if (spot.brick < 0)
-      return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.channels + channel]);
-    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first_number(spot.brick) + channel;
-    return trilinear(voxels, bricks.side, bricks.channels, spot.at(t));
+    if (spot.brick < 0) return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.width + c]);
+    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first_number(spot.brick) + c;
+    return trilinear(voxels, bricks.side, bricks.width, spot.at(t));
   }
 };
 
@@ -298,8 +327,8 @@ struct SampleBricks {
 template <class T, class Voxel>
 struct SpreadGradient {
   FindSample<T, Voxel> find_sample;
-  const T* grad_kc;
-  T *grad_bzyxc, *grad_tnc;
+  GV_GRADIENT(GV_TYPED_VIEW)
+  T *grad_bzyxc = nullptr, *grad_tnc = nullptr;
 
   GV_HD void operator()(int64_t k) const {
     const auto source = find_sample(k);
@@ -309,11 +338,10 @@ struct SpreadGradient {
   }
   GV_HD void spread(const Spot<T>& spot, T t, int64_t k, T share) const {
     const BrickView<Voxel>& bricks = find_sample.bricks;
-    const T* grad_c = grad_kc + k * bricks.channels;
+    const T* grad_c = grad_kc + k * bricks.width;
     if (spot.brick < 0) {
-      T* constant = grad_tnc + static_cast<int64_t>(spot.node) * bricks.channels;
-      for (int32_t channel = 0; channel < bricks.channels; ++channel)
-        add_to(constant + channel, share * grad_c[channel]);
+      T* constant = grad_tnc + static_cast<int64_t>(spot.node) * bricks.width;
+      for (int32_t c = 0; c < bricks.width; ++c) add_to(constant + c, share * grad_c[c]);
       return;
     }
     const EightVoxels<T> corners(spot.at(t), bricks.side);
@@ -324,45 +352,32 @@ struct SpreadGradient {
       const T corner_share = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
                              (dz ? weight[2] : 1 - weight[2]);
       const int64_t z = corners.cell[2] + dz, y = corners.cell[1] + dy, x = corners.cell[0] + dx;
-      T* voxel_c = first + ((z * bricks.side + y) * bricks.side + x) * bricks.channels;
-      for (int32_t channel = 0; channel < bricks.channels; ++channel) {
-        add_to(voxel_c + channel, corner_share * grad_c[channel]);
-      }
+      T* voxel_c = first + ((z * bricks.side + y) * bricks.side + x) * bricks.width;
+      for (int32_t c = 0; c < bricks.width; ++c) add_to(voxel_c + c, corner_share * grad_c[c]);
     }
   }
-};
-
-// Packed samples of rays: those of a ray are consecutive, from front to back.
-struct PackedView {
-  const int64_t* offset_r;  // (r + 1,)
-  int64_t count;
-  int32_t channels;
-
-  GV_HD int64_t begin(int64_t ray) const { return clamp<int64_t>(offset_r[ray], 0, count); }
-  GV_HD int64_t end(int64_t ray) const { return clamp<int64_t>(offset_r[ray + 1], 0, count); }
 };
 
 // Front to back: sum of clear * alpha * feature, where clear is the transmittance of the samples in front. A ray ends
 // where at most `stop_clear` of it is left; samples behind have a `before` of 0. stop_clear 0: all samples count.
 template <class T>
 struct CompositeRay {
-  PackedView packed;
-  const T *alpha_k, *feature_kc, *clear_r;
-  T stop_clear;
+  GV_COMPOSITE(GV_TYPED_VIEW)
+  int64_t count;
+  int32_t width;  // numbers of a feature
   T *sum_rc, *left_r, *before_k;
 
   GV_HD void operator()(int64_t ray) const {
+    const Span samples(offset_r + ray, count);
     T clear = clear_r[ray];
-    T* sum_c = sum_rc + ray * packed.channels;
-    for (int32_t channel = 0; channel < packed.channels; ++channel) sum_c[channel] = 0;
-    for (int64_t k = packed.begin(ray); k < packed.end(ray); ++k) {
+    T* sum_c = sum_rc + ray * width;
+    for (int32_t c = 0; c < width; ++c) sum_c[c] = 0;
+    for (int64_t k = samples.begin; k < samples.end; ++k) {
       const bool ended = stop_clear > 0 && !(clear > stop_clear);
       before_k[k] = ended ? 0 : clear;
       if (ended) continue;
       const T share = clear * alpha_k[k];
-      for (int32_t channel = 0; channel < packed.channels; ++channel) {
-        sum_c[channel] = sum_c[channel] + share * feature_kc[k * packed.channels + channel];
-      }
+      for (int32_t c = 0; c < width; ++c) sum_c[c] = sum_c[c] + share * feature_kc[k * width + c];
       clear = clear * (1 - alpha_k[k]);
     }
     left_r[ray] = clear;
@@ -374,21 +389,21 @@ struct CompositeRay {
 // alpha of 1 is no special case.
 template <class T>
 struct CompositeGradient {
-  PackedView packed;
-  const T *alpha_k, *feature_kc, *before_k, *grad_sum_rc, *grad_left_r;
-  T stop_clear;
+  GV_COMPOSITE_BACKWARD(GV_TYPED_VIEW)
+  int64_t count;
+  int32_t width;  // numbers of a feature
   T *grad_alpha_k, *grad_feature_kc, *grad_clear_r;
 
   GV_HD void operator()(int64_t ray) const {
-    const int64_t begin = packed.begin(ray), end = packed.end(ray);
+    const Span samples(offset_r + ray, count);
     T grad_behind = grad_left_r[ray];  // gradient of the light that enters the samples behind
-    for (int64_t k = end - 1; k >= begin; --k) {
+    for (int64_t k = samples.end - 1; k >= samples.begin; --k) {
       const T before = before_k[k], alpha = alpha_k[k];
       T grad_absorbed = 0;  // gradient of the light that the sample absorbs
-      for (int32_t channel = 0; channel < packed.channels; ++channel) {
-        const T grad = grad_sum_rc[ray * packed.channels + channel];
-        grad_absorbed = grad_absorbed + grad * feature_kc[k * packed.channels + channel];
-        grad_feature_kc[k * packed.channels + channel] = before * alpha * grad;
+      for (int32_t c = 0; c < width; ++c) {
+        const T grad = grad_sum_rc[ray * width + c];
+        grad_absorbed = grad_absorbed + grad * feature_kc[k * width + c];
+        grad_feature_kc[k * width + c] = before * alpha * grad;
       }
       const bool counts = before > 0 || !(stop_clear > 0);
       grad_alpha_k[k] = counts ? before * (grad_absorbed - grad_behind) : 0;

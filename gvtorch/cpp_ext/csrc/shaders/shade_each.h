@@ -35,28 +35,29 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
 // rays, for the plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
-  const auto trace_with = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
-  const auto typed = [&](auto shader, auto voxel) {
-    using Shader = typename decltype(shader)::Shader;
+  const auto trace = [&](auto type, auto... voxel) {  // a voxel of the dtype that is compiled in, if any
+    using Type = decltype(type);
     with_digits<T>(args, [&](auto* digits) {
-      trace_with(ShadeRay<T, Shader, std::decay_t<decltype(*digits)>, false, decltype(voxel)>(args));
+      using Digits = std::decay_t<decltype(*digits)>;
+      shade_each(like, args.nodes,
+                 ShadeRay<T, typename Type::Shader, Digits, Type::kShadows, decltype(voxel)...>(args));
     });
   };
 #ifdef __CUDACC__
   const auto is = [&](ShaderKind kind) { return args.shader == static_cast<int32_t>(kind); };
   if (is(ShaderKind::kFiltered)) {
-    return with_voxel(args.voxel, [&](auto voxel) { typed(ShaderType<Filtered<T>, false>{}, voxel); });
+    return with_voxel(args.voxel, [&](auto voxel) { trace(ShaderType<Filtered<T>, false>{}, voxel); });
   }
   if constexpr (std::is_same_v<T, float>) {
     const ShaderType<StoredColor<T>, false> colors;
-    if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kUInt8) return typed(colors, uint8_t{});
-    if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kHalf) return typed(colors, Half{});
+    if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kUInt8) return trace(colors, uint8_t{});
+    if (is(ShaderKind::kStoredColor) && args.voxel == VoxelType::kHalf) return trace(colors, Half{});
     const ShaderType<Isosurface<T>, false> surface;
-    if (is(ShaderKind::kIsosurface) && args.voxel == VoxelType::kHalf) return typed(surface, Half{});
+    if (is(ShaderKind::kIsosurface) && args.voxel == VoxelType::kHalf) return trace(surface, Half{});
     if (!is_deep(args)) {
       const auto shallow = [&](auto shader, auto voxel) {
         using Shader = typename decltype(shader)::Shader;
-        trace_with(ShadeRay<T, Shader, BitDigits, false, decltype(voxel)>(args));
+        shade_each(like, args.nodes, ShadeRay<T, Shader, BitDigits, false, decltype(voxel)>(args));
       };
       const ShaderType<Lit<T>, false> lit;
       const bool is_lit = is(ShaderKind::kLit);
@@ -72,10 +73,10 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
 #endif
   if constexpr (kTyped) {
     if (args.shader == kPlainShader) {
-      return with_voxel(args.voxel, [&](auto voxel) { typed(ShaderType<Plain<T>, false>{}, voxel); });
+      return with_voxel(args.voxel, [&](auto voxel) { trace(ShaderType<Plain<T>, false>{}, voxel); });
     }
   }
-  with_rays<T>(args, trace_with);
+  with_shader<T>(args.shader, trace);
 }
 
 }  // namespace gvtorch

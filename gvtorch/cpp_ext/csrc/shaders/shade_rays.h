@@ -20,12 +20,11 @@ template <class T, class Shader, class Digits, bool kShadows = false, class Voxe
 struct ShadeRay : Walk<T> {
   using RayProbe = ProbeOf<T, Voxel>;
   using Walk<T>::tree;
-  using Walk<T>::options;
+  using Walk<T>::step;
   using Sum = typename Shader::Sum;
   // Reads of a known dtype are inlined, and a short shader's loop may be instantiated several times. kBlocksPerSM (see
   // for_each.h): 8 leave 64 registers to a thread, 4 leave 128.
-  static constexpr bool kShort =
-      !std::is_void_v<Voxel> && std::is_base_of_v<Plain<T>, Shader> && !std::is_base_of_v<Lit<T>, Shader>;
+  static constexpr bool kShort = !std::is_void_v<Voxel> && Shader::kShort;
   static constexpr int kBlocksPerSM = kShort && Shader::kFiltered == 0 ? 8 : 4;
   static constexpr bool kHidesAlike = Shader::kHidesAlike;
   Shader shader;
@@ -41,18 +40,18 @@ struct ShadeRay : Walk<T> {
   explicit ShadeRay(const ShadeArgs& args)
       : Walk<T>(args),
         shader(args),
-        channels{{args.bricks_bzyxc, args.constant_tnc, args.voxel, args.channels},
+        channels{{args.bricks_bzyxc, args.constant_tnc, args.voxel, args.voxel_width},
                  {args.normal_bzyxc, args.normal_tnc, args.normal_voxel, 3},
-                 {args.other_bzyxc, args.other_tnc, args.other_voxel, args.other_channels},
+                 {args.other_bzyxc, args.other_tnc, args.other_voxel, args.other_width},
                  args.side,
                  args.border,
                  args.component},
         light(args),
         range_tn2c(args.range_tn2c),
         hidden_tn(args.hidden_tn),
-        lengths(args.levels),
+        lengths(args.lengths),
         features(args.features),
-        directions(std::is_same_v<Shader, StoredColor<T>> ? args.channels / 4 : 1),
+        directions(Shader::kColored ? args.voxel_width / 4 : 1),
         normal_r3(static_cast<T*>(args.normal_r3)),
         features_rc(static_cast<T*>(args.features_rc)) {}
 
@@ -61,7 +60,7 @@ struct ShadeRay : Walk<T> {
     if (number < 0) return;
     const Ray<T> ray(this->rays, number);
     const Sight<T> sight(this->rays, number, ray.moved);
-    Intervals<T> intervals(ray, options.step, lengths);
+    Intervals<T> intervals(ray, step, lengths);
     Sum sum;
     sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
     for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
@@ -104,10 +103,10 @@ struct ShadeRay : Walk<T> {
 
   // The same for all rays, computed once per node.
   bool hides(int32_t node) const {
-    uint8_t state = load_byte(&hidden_tn[node]);
+    uint8_t state = __atomic_load_n(&hidden_tn[node], __ATOMIC_RELAXED);  // several threads may write the same value
     if (state == kUnknown) {
       state = hides(shader, node, Sum()) ? kHidden : kShown;
-      store_byte(&hidden_tn[node], state);
+      __atomic_store_n(&hidden_tn[node], state, __ATOMIC_RELAXED);
     }
     return state == kHidden;
   }
@@ -146,8 +145,7 @@ struct ShadeRay : Walk<T> {
   template <class AnyShader>
   struct Visitor {
     static constexpr bool kSeesEmpty = AnyShader::kSeesEmpty, kEnds = AnyShader::kEnds;
-    static constexpr bool kShadowed = kShadows && std::is_same_v<AnyShader, Shader>;  // none for a ray to a light
-    static constexpr bool kToLight = std::is_same_v<AnyShader, Veil<T, Shader>>;
+    static constexpr bool kToLight = AnyShader::kToLight, kShadowed = kShadows && !kToLight;
     const ShadeRay& kernel;
     const AnyShader& shader;
     const Ray<T>* ray;
@@ -266,7 +264,7 @@ struct ShadeRay : Walk<T> {
     const Ray<T> beam(rays, position, direction, probe.cube, ray.cone_near + ray.cone_growth * t,
                       growth * static_cast<T>(rays.cone_scale), length);
     const Sight<T> sight(probe.sight.at(t), direction);
-    Intervals<T> intervals(beam, options.step, lengths);
+    Intervals<T> intervals(beam, step, lengths);
     intervals.move_to(true, intervals.count + 1);
     const Veil<T, Shader> veil{{}, shader};
     typename Veil<T, Shader>::Sum sum;
@@ -289,17 +287,6 @@ struct HideShaded {
     kernel.words_tn[node] = kernel.tree.words_of(node, kernel.hides(kernel.shader, node, typename Kernel::Sum()));
   }
 };
-
-// Calls body(ShadeRay) for the fused shader of the arguments.
-template <class T, class Body>
-void with_rays(const ShadeArgs& args, const Body& body) {
-  with_shader<T>(args.shader, [&](auto type) {
-    using Type = decltype(type);
-    with_digits<T>(args, [&](auto* digits) {
-      body(ShadeRay<T, typename Type::Shader, std::decay_t<decltype(*digits)>, Type::kShadows>(args));
-    });
-  });
-}
 
 }  // namespace GV_NAMESPACE
 }  // namespace gvtorch

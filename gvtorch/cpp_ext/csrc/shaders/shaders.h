@@ -49,6 +49,7 @@ inline namespace GV_NAMESPACE {
 // The transfer function, lit.
 template <class T>
 struct Lit : Plain<T> {
+  static constexpr bool kShort = false;
   template <class V>
   using SumOf = ShadeSum<V>;
   using Plain<T>::transfer;
@@ -69,7 +70,7 @@ struct Lit : Plain<T> {
     const Vec3<V> n = light.normal(probe, piece.middle);
     row = light.shade(row, n, probe, piece.middle, shadow...);
     sum.add_normal(n, sum.clear * row.alpha, shown);
-    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+    sum.add(row, piece, shown);
   }
 };
 
@@ -95,8 +96,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   template <class V>
   GV_HD void add_contribution(MaskOf<V> mask, const LitRow<V>& lit_row, const Piece<V>& piece, ShadeSum<V>& sum) const {
     sum.add_normal(lit_row.normal, sum.clear, mask && lit_row.row.alpha > 0);
-    sum.add_light(lit_row.row, sum.clear, mask);
-    sum.absorb(lit_row.row.alpha, piece.start, piece.length, sum.hit_clear, mask);
+    sum.add_premultiplied(lit_row.row, piece, mask);
   }
   // What one of the nodes adds; 0 in other lanes.
   template <class V, class AnyProbe, class Node>
@@ -127,7 +127,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
     const Vec3<V> d = probe.sight.direction;
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
     const Row<V> color = by_direction(mask, d, colors.width, read, kFiltered);
-    const V stored_alpha = clamp(color.alpha, static_cast<T>(0), static_cast<T>(1));
+    const V stored_alpha = saturate(color.alpha);
     const V alpha =
         stretch(stored_alpha, piece.length * probe.scale_of(node) / own_numbers<Numbers>(this->light.parameters).side);
     const MaskOf<V> shown = mask && stored_alpha > 0 && alpha / stored_alpha > 0;
@@ -152,9 +152,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   template <class V, class Read>
   GV_HD static Moments<V> moments_seen(MaskOf<V> mask, const Read& read, const Vec3<V>& d, Vec3<V>& front) {
     Moments<V> sum{};
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+    GV_NO_UNROLL
     for (int axis = 0; axis < 3; ++axis) {
       const MaskOf<V> against = mask && d[axis] < 0;
       const auto read_moments = [&](MaskOf<V> lanes, int32_t first) { return moments(lanes, read, first); };
@@ -184,7 +182,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
 // The shader of rays to a light (shadow rays): only the transmittance through what another shader shows.
 template <class T, class Shader>
 struct Veil : ShaderFacts {
-  static constexpr bool kHidesAlike = Shader::kHidesAlike;
+  static constexpr bool kHidesAlike = Shader::kHidesAlike, kToLight = true;
   struct Sum {
     T clear = 1;     // transmittance
     T stop_clear{};  // at which the ray ends
@@ -204,7 +202,7 @@ template <class T>
 struct PreIntegrated : ShaderFacts {
   static constexpr bool kEnds = true, kIntegrates = true;
   static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
-    return int64_t{args.levels} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
+    return int64_t{args.lengths} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
   }
   template <class V>
   using SumOf = ShadeSum<V>;
@@ -218,7 +216,7 @@ struct PreIntegrated : ShaderFacts {
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
     const Transfer<T> table(transfer);
-    V lengths = splat<V>(static_cast<T>(1));
+    V lengths = broadcast<V>(static_cast<T>(1));
     if (piece.odd) lengths = piece.length / step;
     const auto pair = [&](V from, V to) { return between(table, from, to, piece.level, mask); };
     const V front = clamp(piece.front, table.low, table.high);
@@ -235,8 +233,7 @@ struct PreIntegrated : ShaderFacts {
       row = choose(outside, parts, with_length(row, lengths));
     }
     if (all_transparent(mask, row.alpha)) return;
-    sum.add_light(row, sum.clear, mask);
-    sum.absorb(row.alpha, piece.start, piece.length, sum.hit_clear, mask);
+    sum.add_premultiplied(row, piece, mask);
   }
   // The row of an interval from one value to another, of a length that the table has.
   template <class V>
@@ -277,16 +274,10 @@ struct Isosurface : ShaderFacts {
   template <class V>
   struct SumOf : ShadeSum<V> {
     V last_value{};
-    V last_end = splat<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began inside, without a surface there
-    V share{};                                         // transmittance in front of the surface
+    V last_end = broadcast<V>(static_cast<T>(-INFINITY));  // +INFINITY: the ray began inside, without a surface there
+    V share{};                                             // transmittance in front of the surface
 
-    template <class A, class B, class Body>
-    GV_HD static void each_member(A& a, B& b, const Body& body) {
-      ShadeSum<V>::each_member(a, b, body);
-      body(a.last_value, b.last_value);
-      body(a.last_end, b.last_end);
-      body(a.share, b.share);
-    }
+    GV_EACH_MEMBER(ShadeSum<V>::each_member(a, b, body); GV_BOTH(last_value) GV_BOTH(last_end) GV_BOTH(share))
   };
   using Sum = SumOf<T>;
   TransferTable<T> transfer;
@@ -302,27 +293,24 @@ struct Isosurface : ShaderFacts {
     T premultiplied;  // 1: the colour is stored times the fourth number
   };
   GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
-  GV_HD T iso() const { return numbers().level; }
-  GV_HD T filled() const { return numbers().filled; }
   GV_HD bool hides(T low, T high, const Sum&) const {
-    return (!(filled() < 0) && a_little_above(high) < iso()) || (!(filled() > 0) && a_little_below(low) >= iso());
+    const T level = numbers().level, filled = numbers().filled;
+    return (!(filled < 0) && a_little_above(high) < level) || (!(filled > 0) && a_little_below(low) >= level);
   }
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
     using Mask = MaskOf<V>;
-    const T level = iso();
+    const T level = numbers().level, filled = numbers().filled;
     const Mask below = piece.front < level;
     const Mask jumped = sum.last_end == piece.start && (sum.last_value < level) != below;
-    const Mask solid = filled() == 0 ? Mask{} : filled() > 0 ? !below : below;
+    const Mask solid = filled == 0 ? Mask{} : filled > 0 ? !below : below;
     const Mask hits_start = mask && (jumped || solid);
     const Mask crosses = mask && !hits_start && below != (piece.back < level);
     V hit_t = piece.start;
     if (any(crosses)) {
       probe.select_lanes(crosses);
       V near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+      GV_NO_UNROLL
       for (int step = 0; step < 4; ++step) {
         const V middle = near + (far - near) * static_cast<T>(0.5);
         const V value = probe.value(middle);
@@ -332,7 +320,7 @@ struct Isosurface : ShaderFacts {
         far = select(same, far, middle);
         far_value = select(same, far_value, value);
       }
-      const V fraction = clamp((level - near_value) / (far_value - near_value), static_cast<T>(0), static_cast<T>(1));
+      const V fraction = saturate((level - near_value) / (far_value - near_value));
       hit_t = select(crosses, near + fraction * (far - near), hit_t);
     }
     const Mask hit = hits_start || crosses, passed = mask && !hit;
@@ -342,7 +330,7 @@ struct Isosurface : ShaderFacts {
     sum.depth = select(hit, hit_t, sum.depth);
     sum.last_value = select(passed, piece.back, sum.last_value);
     sum.last_end = select(passed, piece.end, sum.last_end);
-    sum.last_end = select(begins, splat<V>(static_cast<T>(INFINITY)), sum.last_end);
+    sum.last_end = select(begins, broadcast<V>(static_cast<T>(INFINITY)), sum.last_end);
   }
   GV_HD Row<T> color_at(const Probe<T>& probe, T t) const {
     const auto& color_channel = probe.channels.other;
@@ -354,7 +342,7 @@ struct Isosurface : ShaderFacts {
               stored.blue * numbers().scale / divisor, 0};
     }
     return Transfer<T>(transfer).look_up(
-        color_channel.exists() ? probe.number_at(color_channel, color_component, t) : iso(), 0);
+        color_channel.exists() ? probe.number_at(color_channel, color_component, t) : numbers().level, 0);
   }
   GV_HD void surface(const Probe<T>& probe, Sum& sum) const {
     const T t = sum.depth;
@@ -380,13 +368,7 @@ struct Projection : ShaderFacts {
     V length{};   // sum of lengths
     V value_t{};  // distance of the extreme; for a mean, of the first interval's start
 
-    template <class A, class B, class Body>
-    GV_HD static void each_member(A& a, B& b, const Body& body) {
-      ShadeSum<V>::each_member(a, b, body);
-      body(a.value, b.value);
-      body(a.length, b.length);
-      body(a.value_t, b.value_t);
-    }
+    GV_EACH_MEMBER(ShadeSum<V>::each_member(a, b, body); GV_BOTH(value) GV_BOTH(length) GV_BOTH(value_t))
   };
   using Sum = SumOf<T>;
   TransferTable<T> transfer;
@@ -461,7 +443,7 @@ struct Features : Plain<T> {
         });
       }
     }
-    sum.add(row, piece.start, piece.length, sum.hit_clear, mask);
+    sum.add(row, piece, mask);
   }
 };
 
@@ -486,10 +468,9 @@ struct GradientMagnitude : Plain<T> {
     if (!any(shown)) return;
     probe.select_lanes(shown);
     const Vec3<V> slope = probe.gradient(piece.middle);
-    const V fraction = clamp(square_root(dot(slope, slope)) / own_numbers<Numbers>(parameters).full, static_cast<T>(0),
-                             static_cast<T>(1));
+    const V fraction = saturate(square_root(dot(slope, slope)) / own_numbers<Numbers>(parameters).full);
     row.alpha = select(fraction > 0, stretch(row.alpha, fraction), V{});
-    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+    sum.add(row, piece, shown);
   }
 };
 

@@ -34,9 +34,7 @@ GV_HD auto by_direction(MaskOf<V> mask, const Vec3<V>& d, int32_t width, const R
   };
   const auto z = side(2);
   auto seen = z;
-#ifdef __CUDA_ARCH__
-#pragma unroll 1
-#endif
+  GV_NO_UNROLL
   for (int axis = 0; axis < 2; ++axis) {
     const auto more = combined(side(axis), z, [&](V a, V b) { return d[axis] * d[axis] * (a - b); });
     seen = combined(seen, more, [](V a, V b) { return a + b; });
@@ -50,7 +48,7 @@ GV_HD auto by_direction(MaskOf<V> mask, const Vec3<V>& d, int32_t width, const R
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
-  static bool packets_can_trace(const ShadeArgs& args) { return args.channels == 4; }
+  static bool packets_can_trace(const ShadeArgs& args) { return args.voxel_width == 4; }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
@@ -71,7 +69,7 @@ struct StoredColor : ShaderFacts {
   template <class V, class AnyProbe>
   GV_HD V opacity_of(const Piece<V>& piece, const AnyProbe& probe) const {
     const V value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
-    return clamp(value * numbers().scale, static_cast<T>(0), static_cast<T>(1));
+    return saturate(value * numbers().scale);
   }
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
     return stretch(opacity_of(piece, probe), piece.length / numbers().reference_length);
@@ -94,7 +92,7 @@ struct StoredColor : ShaderFacts {
       row = light.shade(row, n, probe, piece.middle, shadow...);
       sum.add_normal(n, sum.clear * row.alpha, shown);
     }
-    sum.add(row, piece.start, piece.length, sum.hit_clear, shown);
+    sum.add(row, piece, shown);
   }
   // All four numbers as seen along the ray; a packet does not read the opacity, which it already has.
   template <class AnyProbe, class V>
@@ -177,8 +175,7 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
 
   template <class V>
   GV_HD void add_contribution(MaskOf<V> mask, const Row<V>& color, const Piece<V>& piece, ShadeSum<V>& sum) const {
-    sum.add_light(color, sum.clear, mask);
-    sum.absorb(color.alpha, piece.start, piece.length, sum.hit_clear, mask);
+    sum.add_premultiplied(color, piece, mask);
   }
   // Premultiplied colour and alpha of an interval in one of the nodes.
   template <class V, class AnyProbe, class Node>
@@ -196,7 +193,7 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
     const Vec3<V> d = probe.sight.direction;
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
     const Row<V> seen = by_direction(colored, d, colors.width, read);
-    const V stored_alpha = clamp(seen.alpha, static_cast<T>(0), static_cast<T>(1));
+    const V stored_alpha = saturate(seen.alpha);
     const V alpha = stretch(stored_alpha, piece.length * probe.scale_of(node) / own_numbers<Numbers>(parameters).side);
     const V scale = alpha / stored_alpha;
     const MaskOf<V> shown = colored && stored_alpha > 0;

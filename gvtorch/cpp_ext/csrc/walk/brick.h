@@ -36,8 +36,8 @@ GV_HD void with_voxel(VoxelType type, const Body& body) {
   }
 }
 
-inline int64_t brick_bytes(VoxelType type, int32_t side, int32_t channels) {
-  int64_t bytes = int64_t{side} * side * side * channels;
+inline int64_t brick_bytes(VoxelType type, int32_t side, int32_t width) {
+  int64_t bytes = int64_t{side} * side * side * width;
   with_voxel(type, [&](auto voxel) { bytes *= sizeof(voxel); });
   return bytes;
 }
@@ -73,7 +73,7 @@ GV_HD int32_t voxel_below(T position, int32_t side) {
 }
 #ifndef __CUDACC__
 GV_HD Floats voxel_below(Floats position, int32_t side) {
-  return smaller(to_floats(truncated(position)), splat<Floats>(static_cast<float>(side - 2)));
+  return smaller(to_floats(truncated(position)), broadcast<Floats>(static_cast<float>(side - 2)));
 }
 #endif
 
@@ -128,20 +128,20 @@ struct EightVoxels {
 
 // Trilinear interpolation of a brick's voxels, between eight corners or at a position.
 template <class T, class Voxel>
-GV_HD T trilinear(const Voxel* voxels, const EightVoxels<T>& corners, int32_t side, int32_t channels) {
-  const int32_t step_y = channels * side, step_z = step_y * side;
+GV_HD T trilinear(const Voxel* voxels, const EightVoxels<T>& corners, int32_t side, int32_t width) {
+  const int32_t step_y = width * side, step_z = step_y * side;
   const auto offset =
-      static_cast<uint32_t>(corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * channels);
+      static_cast<uint32_t>(corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * width);
   const Voxel* corner = voxels + offset;
   return corners.blend([&](int y, int z, T& left, T& right) {
     const Voxel* first = corner + (z * step_z + y * step_y);
     left = number<T>(first[0]);
-    right = number<T>(first[channels]);
+    right = number<T>(first[width]);
   });
 }
 template <class T, class Voxel>
-GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t channels, Vec3<T> position) {
-  return trilinear(voxels, EightVoxels<T>(position, side), side, channels);
+GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t width, Vec3<T> position) {
+  return trilinear(voxels, EightVoxels<T>(position, side), side, width);
 }
 
 }  // namespace GV_NAMESPACE

@@ -133,7 +133,7 @@ struct Ray {
   // Distance at which the ray leaves a box; face(axis, upper): offset of its lower or upper face from the origin.
   template <class Face>
   GV_HD T exit_distance(const Face& face) const {
-    T exit = splat<T>(static_cast<Real>(INFINITY));
+    T exit = broadcast<T>(static_cast<Real>(INFINITY));
     for (int axis = 0; axis < 3; ++axis) {
       const T distance = face(axis, direction[axis] > 0) * inverse[axis];
       exit = select(direction[axis] == 0, exit, smaller(exit, distance));
@@ -141,14 +141,7 @@ struct Ray {
     return exit;
   }
 
-  // Calls body(a's member, b's member) for each member that differs between lanes.
-  template <class A, class B, class Body>
-  GV_HD static void each_member(A& a, B& b, const Body& body) {
-    body(a.origin, b.origin);
-    body(a.direction, b.direction);
-    body(a.inverse, b.inverse);
-    body(a.moved, b.moved);
-  }
+  GV_EACH_MEMBER(GV_BOTH(origin) GV_BOTH(direction) GV_BOTH(inverse) GV_BOTH(moved))
 };
 
 // The part of a ray for which a tree lookup stays valid: up to `exit`, and while the cone is in [cone_low, cone_high).
@@ -175,12 +168,12 @@ struct Intervals {
   T count{};
   T start;
 
-  GV_HD Intervals(const Ray<T>& ray, T step, int32_t levels)
+  GV_HD Intervals(const Ray<T>& ray, T step, int32_t lengths)
       : cone_near(ray.cone_near),
         cone_growth(ray.cone_growth),
         stop(ray.last),
         step(step),
-        top(levels - 1),
+        top(lengths - 1),
         base(ray.first),
         length(step),
         inverse_length(1 / step),
@@ -208,7 +201,7 @@ struct Intervals {
     base = select(misfits, start, base);
     count = select(misfits, T{}, count);
     level = select(misfits, IntOf<T>{}, level);
-    length = select(misfits, splat<T>(step), length);
+    length = select(misfits, broadcast<T>(step), length);
     for (;;) {
       const Mask longer = misfits && !fits(width) && level < top;
       if (!any(longer)) break;
@@ -235,7 +228,7 @@ struct Intervals {
       const T shortest = larger(extent.cone_low, select(level == 0, extent.cone_low, length));
       limit = select(cone_growth < 0, smaller(limit, (shortest - cone_near) / cone_growth), limit);
     }
-    const T one = splat<T>(static_cast<Real>(1)), longest_run = static_cast<Real>(kMaxIntervals) - count;
+    const T one = broadcast<T>(static_cast<Real>(1)), longest_run = static_cast<Real>(kMaxIntervals) - count;
     IntOf<T> run_length = truncated(clamp((limit - start) * inverse_length + one, one, longest_run));
     for (;;) {
       const Mask excess = mask && run_length > 1 && !is_alike(count + to_real<T>(run_length - 1), extent);
@@ -257,27 +250,14 @@ struct Intervals {
   GV_HD void leave(Mask mask, const Extent<T>& extent) {
     for (Mask inside = mask; any(inside); inside = inside && stays(extent)) {
       const Mask uncut = inside && !cut();
-      IntOf<T> run_length = splat<IntOf<T>>(1);
+      IntOf<T> run_length = broadcast<IntOf<T>>(1);
       if (any(uncut)) run_length = select(uncut, run(uncut, extent), run_length);
       move_to(inside, count + to_real<T>(run_length));
     }
   }
 
-  // Calls body(a's member, b's member) for each member.
-  template <class A, class B, class Body>
-  GV_HD static void each_member(A& a, B& b, const Body& body) {
-    body(a.cone_near, b.cone_near);
-    body(a.cone_growth, b.cone_growth);
-    body(a.stop, b.stop);
-    body(a.step, b.step);
-    body(a.top, b.top);
-    body(a.level, b.level);
-    body(a.base, b.base);
-    body(a.length, b.length);
-    body(a.inverse_length, b.inverse_length);
-    body(a.count, b.count);
-    body(a.start, b.start);
-  }
+  GV_EACH_MEMBER(GV_BOTH(cone_near) GV_BOTH(cone_growth) GV_BOTH(stop) GV_BOTH(step) GV_BOTH(top) GV_BOTH(level)
+                     GV_BOTH(base) GV_BOTH(length) GV_BOTH(inverse_length) GV_BOTH(count) GV_BOTH(start))
 };
 
 }  // namespace GV_NAMESPACE

@@ -1,4 +1,5 @@
-// The transfer function as a table, and front-to-back compositing. T is as in arithmetic.h.
+// The transfer function as a table; Piece, an interval; and ShadeSum, which composites intervals from front to back. T
+// is as in arithmetic.h.
 #pragma once
 
 #include "base/arguments.h"
@@ -15,6 +16,7 @@ struct alignas(16) alignas(T) Row {
   GV_HD T operator[](int column) const {
     return column == 0 ? red : (column == 1 ? green : (column == 2 ? blue : alpha));
   }
+  GV_EACH_MEMBER(GV_BOTH(red) GV_BOTH(green) GV_BOTH(blue) GV_BOTH(alpha))
 };
 constexpr int kAlpha = 3;
 
@@ -145,7 +147,7 @@ struct Transfer {
   template <class V>
   GV_HD Cell<V> find(V value) const {
     const V position = row_position(value);
-    const IntOf<V> row = smaller(truncated(position), splat<IntOf<V>>(rows - 2));
+    const IntOf<V> row = smaller(truncated(position), broadcast<IntOf<V>>(rows - 2));
     return {row, position - to_real<V>(row)};
   }
 
@@ -198,37 +200,72 @@ using TransferTable = Transfer<T>;
 template <class T>
 GV_HD T stretch(T alpha, T lengths) {
   using Real = RealOf<T>;
-  const T transmittance = 1 - alpha, opaque = splat<T>(static_cast<Real>(1));
+  const T transmittance = 1 - alpha, opaque = broadcast<T>(static_cast<Real>(1));
   const auto translucent = transmittance > static_cast<Real>(1.1754944e-38f);
   if (!any(translucent)) return opaque;
   return select(translucent, 1 - exp2_exact(log2_exact(transmittance) * lengths), opaque);
 }
 
+// An interval of a ray, or of each ray of a packet.
 template <class T>
-struct Accumulator {
+struct Piece {
+  T start, end, length, middle;  // distances, world units
+  IntOf<T> level{};              // the length is step * 2^level, unless `odd`
+  T value;                       // in the middle
+  T front, back;                 // values at both ends, for shaders with kEnds
+  bool odd = false;              // of any length, with level 0
+
+  // Without the values, of which a shader has only some.
+  GV_EACH_MEMBER(GV_BOTH(start) GV_BOTH(end) GV_BOTH(length) GV_BOTH(middle) GV_BOTH(level) GV_BOTH(odd))
+};
+
+// The sums of a ray, or of each ray of a packet.
+template <class T>
+struct ShadeSum {
   using Real = RealOf<T>;
   using Mask = MaskOf<T>;
   T red{}, green{}, blue{};
-  T clear = splat<T>(static_cast<Real>(1));  // transmittance
-  T depth = splat<T>(static_cast<Real>(INFINITY));
-  Mask missed{};  // visible data was missing
+  T clear = broadcast<T>(static_cast<Real>(1));  // transmittance
+  T depth = broadcast<T>(static_cast<Real>(INFINITY));
+  Mask missed{};                           // visible data was missing
+  Vec3<T> normal{};                        // towards the eye, weighted by share
+  Real hit_clear;                          // transmittance at which depth is recorded
+  typename LanesOf<T>::Pointer feature_c;  // of each lane
 
-  // Adds an interval.
-  GV_HD void add(const Row<T>& row, T start, T length, Real hit_clear, Mask mask = all_lanes<T>()) {
-    add_light(row, clear * row.alpha, mask);
-    absorb(row.alpha, start, length, hit_clear, mask);
+  // Begins a new ray in a lane.
+  GV_HD void begin(int lane, Real clear, Real hit_clear, Real* feature_c) {
+    set_lane(this->clear, lane, clear);
+    this->hit_clear = hit_clear;
+    set_lane(this->feature_c, lane, feature_c);
   }
+  // Adds an interval of a colour, premultiplied or not.
+  GV_HD void add(const Row<T>& row, const Piece<T>& piece, Mask mask = all_lanes<T>()) {
+    add_light(row, clear * row.alpha, mask);
+    absorb(row.alpha, piece, mask);
+  }
+  GV_HD void add_premultiplied(const Row<T>& row, const Piece<T>& piece, Mask mask) {
+    add_light(row, clear, mask);
+    absorb(row.alpha, piece, mask);
+  }
+  GV_HD void add_normal(Vec3<T> n, T share, Mask mask = all_lanes<T>()) {
+    for (int axis = 0; axis < 3; ++axis) normal[axis] = select(mask, normal[axis] + share * n[axis], normal[axis]);
+  }
+
+  GV_EACH_MEMBER(GV_BOTH(red) GV_BOTH(green) GV_BOTH(blue) GV_BOTH(clear) GV_BOTH(depth) GV_BOTH(missed) GV_BOTH(normal)
+                     GV_BOTH(hit_clear) GV_BOTH(feature_c))
+
+ private:
   GV_HD void add_light(const Row<T>& row, T share, Mask mask) {
     red = select(mask, red + share * row.red, red);
     green = select(mask, green + share * row.green, green);
     blue = select(mask, blue + share * row.blue, blue);
   }
   // Depth is where in the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
-  GV_HD void absorb(T alpha, T start, T length, Real hit_clear, Mask mask) {
+  GV_HD void absorb(T alpha, const Piece<T>& piece, Mask mask) {
     const T clear_after = clear * (1 - alpha);
     for_lanes(mask && clear_after < hit_clear && clear >= hit_clear, [&](int lane) {
       const Real fraction = hit_fraction(lane_of(clear, lane), lane_of(alpha, lane), hit_clear);
-      set_lane(depth, lane, lane_of(start, lane) + fraction * lane_of(length, lane));
+      set_lane(depth, lane, lane_of(piece.start, lane) + fraction * lane_of(piece.length, lane));
     });
     clear = select(mask, clear_after, clear);
   }
@@ -236,18 +273,7 @@ struct Accumulator {
   GV_HD static Real hit_fraction(Real clear, Real alpha, Real hit_clear) {
     const Real transmittance = 1 - alpha;
     if (!(transmittance > static_cast<Real>(1.1754944e-38f))) return 0;
-    return clamp(log2_exact(hit_clear / clear) / log2_exact(transmittance), static_cast<Real>(0), static_cast<Real>(1));
-  }
-
-  // Calls body(a's member, b's member) for each member that differs between lanes.
-  template <class A, class B, class Body>
-  GV_HD static void each_member(A& a, B& b, const Body& body) {
-    body(a.red, b.red);
-    body(a.green, b.green);
-    body(a.blue, b.blue);
-    body(a.clear, b.clear);
-    body(a.depth, b.depth);
-    body(a.missed, b.missed);
+    return saturate(log2_exact(hit_clear / clear) / log2_exact(transmittance));
   }
 };
 

@@ -210,13 +210,13 @@ struct BitDigits {
   }
 };
 
-// Calls body with a null pointer to the type of digits for rays of T in a tree; the type can't be default-constructed.
+// Returns body of a null pointer to the type of digits for rays of T in a tree; the type can't be default-constructed.
 template <class T, class Body>
-void with_digits(const TraceArgs& args, const Body& body) {
+auto with_digits(const TraceArgs& args, const Body& body) {
   if constexpr (std::is_same_v<T, float>) {
     if (!is_deep(args)) return body(static_cast<BitDigits*>(nullptr));
   }
-  body(static_cast<Digits<T>*>(nullptr));
+  return body(static_cast<Digits<T>*>(nullptr));
 }
 
 // Descends to `wanted` depth, or as far as tiles exist and something is visible; stamps every tile on the way.

@@ -11,21 +11,6 @@
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
 
-template <class T>
-struct TraceOptions {
-  T step;         // world length of the shortest interval
-  bool by_level;  // a node's brick is requested before its children
-};
-
-template <class T>
-struct HitView {
-  T* color_r3;
-  T* alpha_r1;
-  T* depth_r1;
-  int32_t* samples_r;
-  bool* missed_r;
-};
-
 // Whether a node is hidden. The CPU computes this when the first ray reaches a node, since most are never visited; a
 // GPU, where many threads would repeat it, does so for all nodes before the rays are traced: see NodeWords.
 constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
@@ -65,8 +50,11 @@ struct Walk {
   RayOrder order;
   TreeView tree;
   Levels<T> levels;
-  TraceOptions<T> options;
-  HitView<T> hits;
+  T step;         // world length of the shortest interval
+  bool by_level;  // a node's brick is requested before its children
+  T *color_r3, *alpha_r1, *depth_r1;
+  int32_t* samples_r;
+  bool* missed_r;
   const int32_t* frame_1;
   int32_t* stamp_b;
   T stop_clear, hit_clear;  // transmittance at which a ray ends, and at which its depth is recorded
@@ -90,9 +78,13 @@ struct Walk {
              static_cast<int32_t>(args.nodes / args.nodes_per_tile),
              static_cast<int32_t>(args.bricks)},
         levels(args.root_voxel, args.side - 2 * args.border, args.branching),
-        options{static_cast<T>(args.step), args.by_level},
-        hits{static_cast<T*>(args.color_r3), static_cast<T*>(args.alpha_r1), static_cast<T*>(args.depth_r1),
-             args.samples_r, args.missed_r},
+        step(static_cast<T>(args.step)),
+        by_level(args.by_level),
+        color_r3(static_cast<T*>(args.color_r3)),
+        alpha_r1(static_cast<T*>(args.alpha_r1)),
+        depth_r1(static_cast<T*>(args.depth_r1)),
+        samples_r(args.samples_r),
+        missed_r(args.missed_r),
         frame_1(args.frame_1),
         stamp_b(args.stamp_b),
         stop_clear(1 - static_cast<T>(args.stop_alpha)),
@@ -200,8 +192,8 @@ struct Walk {
     const bool brick_missing = descent.brick == kAbsent;
     const bool too_coarse = descent.depth < wanted && descent.tile == kAbsent;
     const bool parent_lacks = blend && descent.depth == wanted && tree.brick_of(descent.parent) == kAbsent;
-    if (too_coarse && !(options.by_level && brick_missing)) request(descent.node, descent.depth, cone, kSubdivide);
-    if (brick_missing && (options.by_level || !too_coarse || descent.fine.node < 0)) {
+    if (too_coarse && !(by_level && brick_missing)) request(descent.node, descent.depth, cone, kSubdivide);
+    if (brick_missing && (by_level || !too_coarse || descent.fine.node < 0)) {
       request(descent.node, descent.depth, cone, kLoad);
     }
     if (parent_lacks) request(descent.parent, descent.depth - 1, cone, kLoad);
@@ -217,14 +209,14 @@ struct Walk {
   }
 
   // Stores the results of a ray. `moved`: distance from the camera to the ray's origin, from where sum.depth counts.
-  GV_HD void store(int64_t number, const Accumulator<T>& sum, T moved, int32_t samples) const {
-    hits.color_r3[3 * number] = sum.red;
-    hits.color_r3[3 * number + 1] = sum.green;
-    hits.color_r3[3 * number + 2] = sum.blue;
-    hits.alpha_r1[number] = 1 - sum.clear;
-    hits.depth_r1[number] = sum.depth + moved;
-    hits.samples_r[number] = samples;
-    hits.missed_r[number] = sum.missed;
+  GV_HD void store(int64_t number, const ShadeSum<T>& sum, T moved, int32_t samples) const {
+    color_r3[3 * number] = sum.red;
+    color_r3[3 * number + 1] = sum.green;
+    color_r3[3 * number + 2] = sum.blue;
+    alpha_r1[number] = 1 - sum.clear;
+    depth_r1[number] = sum.depth + moved;
+    samples_r[number] = samples;
+    missed_r[number] = sum.missed;
   }
 };
 
