@@ -130,7 +130,7 @@ class Piece:
     count: Tensor  # (r,) number of intervals since the base, as a float
 
 
-class Accumulator:
+class ShadeSum:
     """Front-to-back sums of every ray."""
 
     def __init__(self, beam: Beam, hit_clear: Tensor, clear_r: Tensor | None) -> None:
@@ -341,7 +341,7 @@ class Walk:
 class Plain(Visitor):
     """The transfer function."""
 
-    sum: Accumulator
+    sum: ShadeSum
     stop_clear: Tensor  # (): a ray ends where its transmittance is not above this
 
     @classmethod
@@ -351,7 +351,7 @@ class Plain(Visitor):
             1 - torch.tensor(alpha, dtype=args.table_lm4.dtype).to(args.table_lm4)
             for alpha in (args.depth_alpha, args.stop_alpha)
         )
-        sums = Accumulator(walk.intervals.beam, hit_clear, rays.clear_r)
+        sums = ShadeSum(walk.intervals.beam, hit_clear, rays.clear_r)
         return cls(Transfer(args), walk.channel, sums, stop_clear, *fields)
 
     def goes_on(self, leaving: Tensor) -> Tensor:

@@ -18,7 +18,7 @@
 // rows). Then follow the rows of the functions, one channel after the other: red, green, blue, and h of an interval
 // of length step * 2^level.
 //
-// Equal to ops/reference/shaders.py. Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995.
+// Equal to ops/reference/channels.py. Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995.
 #pragma once
 
 #include "shaders/plain.h"

@@ -1,7 +1,7 @@
 // Voxels that hold labels (the numbers of things in a segmentation): each position shows the label of its nearest
 // voxel, and no two labels are ever mixed.
 //
-// Equal to ops/reference/shaders.py and labels.py.
+// Equal to ops/reference/labels.py.
 #pragma once
 
 #include "shaders/plain.h"

@@ -1,6 +1,6 @@
 // Shaders that read colours from voxels: stored ones, and those that a transfer function made of finer voxels.
 //
-// Equal to ops/reference/shaders.py.
+// Equal to ops/reference/stored_color.py.
 #pragma once
 
 #include "shaders/plain.h"
