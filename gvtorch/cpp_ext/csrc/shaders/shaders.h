@@ -34,9 +34,10 @@
 // voxel this clamp changes nothing, so an end has the same value from both sides; and since all values read lie in the
 // node's range, skipping a hidden node changes no bit.
 //
-// Equal to ops/reference/shaders.py and lit.py. Sources: Blinn, "Models of light reflection for computer synthesized pictures",
-// SIGGRAPH 1977; Engel, Kraus, Ertl, "High-quality pre-integrated volume rendering using hardware-accelerated pixel
-// shading", Graphics Hardware 2001; Levoy, "Display of surfaces from volume data", IEEE CG&A 1988.
+// Equal to ops/reference/shaders.py and lit.py. Sources: Blinn, "Models of light reflection for computer synthesized
+// pictures", SIGGRAPH 1977; Engel, Kraus, Ertl, "High-quality pre-integrated volume rendering using
+// hardware-accelerated pixel shading", Graphics Hardware 2001; Levoy, "Display of surfaces from volume data", IEEE CG&A
+// 1988.
 #pragma once
 
 #include "shaders/channels.h"
