@@ -16,7 +16,7 @@ GV_OP(WriteSegmentsOp, "write_segments", GV_WRITE_SEGMENTS,
       "(Tensor ray_s, Tensor node_s2, Tensor brick_s2, Tensor depth_s3, Tensor interval_s3, Tensor distance_s3, "
       "Tensor t0_s, Tensor t1_s)");
 
-// Returns body of the op's WalkRay.
+// Returns body(the op's WalkRay).
 template <class Op, class Body>
 auto with_walk(const Op& a, const Body& body) {
   const ShadeArgs walk_args = make_walk_args(a);
