@@ -103,8 +103,7 @@ def compile_libraries(output: Path) -> list[Path]:
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
     output.mkdir(parents=True, exist_ok=True)
     calls = commands(output)
-    workers = max(1, (os.cpu_count() or 1) - (len(calls) - 1))  # one core is left to nvcc
-    with ThreadPoolExecutor(workers) as pool, ThreadPoolExecutor(len(calls)) as linkers:
+    with ThreadPoolExecutor(os.cpu_count()) as pool, ThreadPoolExecutor(len(calls)) as linkers:
 
         def make(library: Path) -> None:
             stamp = library.with_suffix(".stamp")
