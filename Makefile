@@ -49,10 +49,8 @@ gallery: $(VENV)/ready
 # glibc would hand each large tensor's memory back to the system, and the next one would wait for it to be cleared: kept,
 # the tests take a seventh less time.
 KEEP := MALLOC_MMAP_THRESHOLD_=1000000000 MALLOC_TRIM_THRESHOLD_=4000000000
-# One more than there are cores: tests also wait, for processes, sockets and browsers.
-WORKERS := $(shell n=$$(nproc); echo $$((n < 4 ? n + 1 : 4)))
 test: $(VENV)/ready
-	OMP_NUM_THREADS=1 $(KEEP) GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
+	OMP_NUM_THREADS=1 $(KEEP) GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal \
 	  --durations 20 --durations-min 5 $(ARGS)
 
 FRAMES ?= 100000
