@@ -67,6 +67,8 @@ FOREIGN = {
     *("open_NAME", "entry_NAME", "_take_NAME", "test_formats_"),
     *("smoke", "hyg_stars", "scan_512x512x300_int16"),
 }
+#: Fields of a syntax tree's nodes that hold names.
+NAME_FIELDS = frozenset(("id", "attr", "name", "arg", "asname", "module"))
 #: Endings of files of code that is not Python.
 CODE = (".h", ".cpp", ".cu", ".js", ".css", ".html", ".toml")
 #: Pages on the past, whose names may be gone.
@@ -81,24 +83,30 @@ def tracked() -> list[Path]:
     return [path for name in run.stdout.splitlines() if (path := ROOT / name).is_file()]
 
 
-def docstrings(tree: ast.AST) -> list[ast.Constant]:
-    """Returns the strings that are statements: docstrings, and texts below fields."""
-    values = [node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)]
-    return [v for v in values if isinstance(v, ast.Constant) and isinstance(v.value, str)]
-
-
-def names_in_python(text: str) -> set[str]:
-    """Returns identifiers, and the words of strings without a space, which may be names."""
-    tree, names = ast.parse(text), set()
-    documentation = {id(node) for node in docstrings(tree)}
+@cache
+def names_and_docstrings(path: Path) -> tuple[set[str], list[str]]:
+    """Returns a module's identifiers, with the words of strings without a space, which may be
+    names; and the strings that are statements: docstrings, and texts below fields.
+    """
+    names: set[str] = set()
+    strings: dict[int, str] = {}
+    docstrings: dict[int, str] = {}
+    tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
-        for field in ("id", "attr", "name", "arg", "asname", "module"):
-            value = getattr(node, field, None)
-            names |= set(value.split(".")) if isinstance(value, str) else set()
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            is_name = " " not in node.value and id(node) not in documentation
-            names |= set(WORD.findall(node.value)) if is_name else set()
-    return names
+        if isinstance(node, ast.Constant):
+            if isinstance(node.value, str):
+                strings[id(node)] = node.value
+        elif isinstance(node, ast.Expr):
+            if isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+                docstrings[id(node.value)] = node.value.value
+        else:
+            for field in NAME_FIELDS.intersection(node._fields):
+                value = getattr(node, field)
+                names.update(value.split(".") if isinstance(value, str) else ())
+    for key, value in strings.items():
+        if " " not in value and key not in docstrings:
+            names.update(WORD.findall(value))
+    return names, [*docstrings.values()]
 
 
 @cache
@@ -110,7 +118,7 @@ def names_in_code() -> set[str]:
         if path == Path(__file__):
             continue
         if path.suffix in (".py", ".pyi"):
-            names |= names_in_python(path.read_text(encoding="utf-8"))
+            names |= names_and_docstrings(path)[0]
         elif path.suffix in CODE or path.name in ("Makefile", "run"):
             code = re.sub(r"//.*|^#.*", "", path.read_text(encoding="utf-8"), flags=re.M)
             names |= set(WORD.findall(code))
@@ -123,7 +131,7 @@ def documentation(path: Path) -> str:
     if path.suffix == ".md":
         return prose(text)
     comments = re.findall(r"#.*", text)
-    return "\n\n".join([node.value for node in docstrings(ast.parse(text))] + comments)
+    return "\n\n".join(names_and_docstrings(path)[1] + comments)
 
 
 def unknown(text: str) -> list[str]:
@@ -131,11 +139,10 @@ def unknown(text: str) -> list[str]:
     spans = re.findall(r"`([^`]+)`", text)
     words = [word for span in spans for word in WORD.findall(span)]
     paths = [p for span in spans for p in re.findall(r"[\w./]+/[\w.]+\.(?:py|h|cpp|js|md)\b", span)]
-    files = [f"/{path.relative_to(ROOT)}" for path in tracked()]
     return [word for word in words if word not in names_in_code()] + [
         path
         for path in paths
-        if "NAME" not in path and not any(f.endswith(f"/{path}") for f in files)
+        if "NAME" not in path and not any(str(file).endswith(f"/{path}") for file in tracked())
     ]
 
 
