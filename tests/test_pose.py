@@ -218,6 +218,18 @@ def test_what_is_no_pose_is_told_in_a_line(tree, pose, message):
     assert "\n" not in str(error.value)
 
 
+def test_poses_by_name_are_refused_by_the_function_that_was_called(tree):
+    view, pose = gv.Camera.orbit(0, 0, None, None, 8, 8), {"a": np.eye(4)}
+    rays = view.placed(tree.box).rays()
+    for name, call in {
+        "render": lambda: gv.render(tree, view, SHADER, pose=pose),
+        "trace": lambda: gv.trace(tree, rays, SHADER, pose=pose),
+        "cost": lambda: gv.cost(tree, view, SHADER, pose=pose),
+    }.items():
+        with pytest.raises(ValueError, match=f"^{name}: poses by name are for trees by name"):
+            call()
+
+
 def test_poses_of_several_trees_go_by_name(tree):
     view = gv.Camera.orbit(0, 0, None, None, 8, 8)
     trees = {"a": tree, "b": tree}

@@ -155,6 +155,27 @@ def test_a_root_that_cannot_be_made_is_an_error_at_once(how):
         gv.Engine(Rootless(how), patience=0.1, **SIZE)
 
 
+class Watched(Ball):
+    closed = False
+
+    def close(self):
+        self.closed = True
+
+
+class Stopped(Ball):
+    """Ctrl-C arrives while the root is made."""
+
+    def classify(self, nodes):
+        raise KeyboardInterrupt
+
+
+def test_an_engine_that_is_interrupted_while_it_opens_closes_its_producers():
+    first = Watched()
+    with pytest.raises(KeyboardInterrupt):
+        gv.Engine({"first": first, "second": Stopped()})
+    assert first.closed
+
+
 @pytest.mark.parametrize("patience", [20.0, float("inf")])
 def test_the_root_is_waited_for_as_long_as_the_producer_says(patience):
     pool = ThreadPoolExecutor(1)

@@ -69,7 +69,7 @@ def test_second_channel_and_second_component(blobs, compiled):
     assert torch.equal(result["alpha"], single["alpha"])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     share=st.floats(0, 1),
     seed=st.integers(0, 2**31),

@@ -207,7 +207,7 @@ def assert_message_or_line(text: str | bytes) -> None:
     assert type(message) in MESSAGES.values()
 
 
-@settings(max_examples=600, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=1500, deadline=None, suppress_health_check=list(HealthCheck))
 @given(NEAR.map(json.dumps) | st.text() | st.binary())
 def test_whatever_comes_is_a_message_or_a_line(text):
     assert_message_or_line(text)

@@ -416,7 +416,7 @@ class Camera:
         at = CameraColumns
         moved = continued(now, before, frames, at.POSE, at.ROTATION)
         moved[:, at.FOCAL] /= stride
-        moved[:, at.CENTRE] = (moved[:, at.CENTRE] - (stride - 1) / 2) / stride
+        moved[:, at.CENTER] = (moved[:, at.CENTER] - (stride - 1) / 2) / stride
         return moved
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:

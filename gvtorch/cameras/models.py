@@ -58,12 +58,12 @@ class PixelRows:
     def x(self) -> Tensor:
         """(k, w) float64."""
         column = torch.arange(self.width, dtype=torch.float64, device=self.cameras.device)
-        return (column - self.centre[:, :1]) / self.focal[:, :1]
+        return (column - self.center[:, :1]) / self.focal[:, :1]
 
     @cached_property
     def y(self) -> Tensor:
         """(y,) float64."""
-        return (self.row % self.height - self.centre[:, 1]) / self.focal[:, 1]
+        return (self.row % self.height - self.center[:, 1]) / self.focal[:, 1]
 
     @property
     def focal(self) -> Tensor:
@@ -71,9 +71,9 @@ class PixelRows:
         return self.numbers[:, CameraColumns.FOCAL]
 
     @property
-    def centre(self) -> Tensor:
+    def center(self) -> Tensor:
         """(k, 2) principal point, pixels."""
-        return self.numbers[:, CameraColumns.CENTRE]
+        return self.numbers[:, CameraColumns.CENTER]
 
     @property
     def rotation(self) -> Tensor:

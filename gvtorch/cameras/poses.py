@@ -29,14 +29,14 @@ class Coordinates(Enum):
 
     @classmethod
     def of(cls, context: str, value: Coordinates | str) -> Coordinates:
-        """Returns the frame of this name; raises ValueError where there is none."""
+        """Returns the member of this name; raises ValueError where there is none."""
         try:
             return cls(value)
         except ValueError:
             raise ValueError(f"{context}: frame must be 'world' or 'box', got {value!r}") from None
 
     def unit(self, box: Tensor) -> float:
-        """Returns its unit of length, world units, given the (2, 3) box of the scene."""
+        """Returns their unit of length in world units, given the (2, 3) box of the scene."""
         return 1.0 if self is Coordinates.WORLD else float((box[1] - box[0]).max())
 
 

@@ -98,8 +98,8 @@ class RecordedFrame(ABC):
         """Writes what earlier frames missed."""
 
     def take_host_needed(self, readbacks: Readbacks) -> bool:
-        """Returns whether `Engine.frame` must render the next frame, which names the nodes that
-        fail and requests targets of aliases; once for each answer that `host_needed` is about.
+        """Returns whether `Engine.frame` must render the next frame, because it names the nodes
+        that fail and requests the targets of aliases. Resets `host_needed`.
         """
         needed = readbacks.failed or self.host_needed or len(self.cache.aliases) > 0
         self.host_needed = False

@@ -67,7 +67,7 @@ class FrameSteps:
             for name, producer in producers.items():
                 self.trees[name] = make_tree(self.cache, self.options, layouts, name, producer)
                 self._versions[name] = producer.version
-        except Exception:
+        except BaseException:  # Ctrl-C as well
             self.close()
             raise
 

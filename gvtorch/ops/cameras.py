@@ -16,7 +16,7 @@ class PinholeColumns:
     ROTATION = slice(0, 9)  # (3, 3), world to camera
     POSITION = slice(9, 12)  # world
     FOCAL = slice(12, 14)  # x, y; pixels
-    CENTRE = slice(14, 16)  # principal point x, y; pixels, whose centres are at integers
+    CENTER = slice(14, 16)  # principal point x, y; pixels, whose centres are at integers
     CONE = slice(16, 18)  # as in `Rays`
     RANGE = slice(18, 20)
 
@@ -54,7 +54,7 @@ def pinhole_rays(
     camera = camera_nc[row // height]  # of each row
     at = PinholeColumns
     fx, fy = camera[:, at.FOCAL].split(1, 1)
-    cx, cy = camera[:, at.CENTRE].split(1, 1)
+    cx, cy = camera[:, at.CENTER].split(1, 1)
     x, y = (column - cx) / fx, ((row % height)[:, None] - cy) / fy
     rotation = camera[:, at.ROTATION].unflatten(1, (3, 3))
     length = sqrt_exact(x * x + (y * y + 1))

@@ -26,6 +26,7 @@ from ..shaders.transfer_function import TransferFunction
 from .effects import TreeTrace
 from .options import RenderOptions, RenderSettings, render_options
 from .pixels import View, tree_stats, using
+from .pose import pose_alone
 from .tracer import Batch, Tracer, march
 
 Image = Literal["samples", "nodes", "lod", "age", "fill"]
@@ -122,6 +123,7 @@ def cost(
     chosen = render_options("cost", options, camera)
     check.instance("cost", "tree", tree, N3Tree)
     transfer = check.instance("cost", "shader", shader, TransferFunction)
+    pose_alone("cost", chosen.pose)
     start = time.perf_counter()
     counter = _Counter(tree, transfer, chosen)
     counted = TreeTrace.of(counter, chosen)

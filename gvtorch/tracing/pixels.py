@@ -30,6 +30,7 @@ from ..pool import N3Tree
 from .composite import nothing_like
 from .effects import TreeTrace
 from .options import RenderOptions, RenderSettings, render_options
+from .pose import pose_alone
 from .tracer import Tracer
 from .trees import Shaders, box_around, trace_trees, tree_traces
 
@@ -168,6 +169,7 @@ def _begin_frame(
         return tree_traces(context, channels_by_tree, shaders, options)
     if isinstance(shaders, Mapping):
         raise ValueError(f"{context}: shaders by name are for trees by name")
+    pose_alone(context, options.pose)
     return [TreeTrace.of(Tracer(scene, shaders, options), options)]
 
 

@@ -129,6 +129,16 @@ def poses_of(context: str, names: Collection[str], poses: Any) -> dict[str, Pose
     return dict.fromkeys(names, poses)
 
 
+def pose_alone(context: str, poses: Any) -> Pose | None:
+    """Returns the pose of a tree that has no name, given a result of `checked_poses`; raises
+    ValueError if poses are given by name.
+    """
+    if isinstance(poses, Mapping):
+        raise ValueError(f"{context}: poses by name are for trees by name")
+    pose: Pose | None = poses
+    return pose
+
+
 def world_box(tree_box: Tensor, pose: Pose | None) -> Tensor:
     """Returns (2, 3) corners of the world box around a tree's box."""
     return tree_box if pose is None else pose.box(tree_box)

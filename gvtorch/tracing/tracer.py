@@ -25,7 +25,7 @@ from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Sampling, Shader, check_shader, interval_levels
 from .composite import reaches_depth, tree_span
 from .options import RenderOptions
-from .pose import Pose
+from .pose import pose_alone
 
 #: What the ops give, in order; `trace_rays` the first five only.
 _RESULTS = ("color", "alpha", "depth", "samples", "missed", "normal", "features")
@@ -55,9 +55,7 @@ class Tracer:
         _check_step(tree, step, options)
         tree.warn_if_edited(learned=isinstance(shader, ModuleShader))
         self.tree, self.shader, self.channel = tree, shader, channel
-        if options.pose is not None and not isinstance(options.pose, Pose):
-            raise ValueError("render: poses by name are for trees by name")
-        self.pose = options.pose
+        self.pose = pose_alone("render", options.pose)
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
         scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
