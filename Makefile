@@ -22,7 +22,8 @@ NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/de
 # system's (Debian: libegl1, libgl1-mesa-dri; chromium). With CI set, both must be there.
 REQUIRE := reference,cpp,io$(if $(CI)$(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
 REQUIRE := $(REQUIRE)$(if $(CI)$(shell command -v chromium chromium-browser google-chrome),$(COMMA)browser)
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt
+# Of 16,000 files of Python, those that are imported are compiled then; all at once would take a minute.
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint .ci/constraints.txt
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
 # Containers often set this; the tests' many processes would each compile all of gvtorch's Python.
