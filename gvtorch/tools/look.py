@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -132,13 +132,28 @@ class Look:
         """Returns the files that are read in addition to the volume, by flag."""
         return {"--tf": self.tf, "--background": self.background}
 
-    def flags_set_by(self, state: Mapping[str, Any]) -> list[str]:
-        """Returns the given flags that a saved state sets as well, so that they would have no
-        effect.
+    def check_state(
+        self,
+        state_flag: str,
+        state: Mapping[str, Any],
+        other_flags: Sequence[str] = (),
+        camera: str | None = None,
+    ) -> None:
+        """Raises ValueError if a flag would have no effect, because a saved state sets the same.
+
+        Args:
+            state_flag: The flag that gives the state.
+            state: The state's fields, unchecked.
+            other_flags: Further given flags that any state sets.
+            camera: Value of --camera.
         """
-        fields = {name for part, names in _STATE_FIELDS.items() if part in state for name in names}
+        parts = [part for part in _STATE_FIELDS if state.get(part) is not None]
+        fields = {name for part in parts for name in _STATE_FIELDS[part]}
         fields |= set(state.get("options", ()))
-        return [flag for flag in given_flags(self) if flag[2:].replace("-", "_") in fields]
+        flags = [*other_flags, *["--camera"] * (camera is not None and "camera" in parts)]
+        flags += [flag for flag in given_flags(self) if flag[2:].replace("-", "_") in fields]
+        if flags:
+            raise ValueError(f"{state_flag} sets what {flags[0]} sets: leave one out")
 
     def device(self) -> torch.device:
         """Returns the device that the backend needs; for auto, CUDA if it can be used."""

@@ -25,7 +25,7 @@ from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
 from ..pool import N3Tree
 from ..shaders import Shader, TransferFunction
-from ..tracing import RenderOptions, render
+from ..tracing import Cost, RenderOptions, render
 from .schema import decode, encode
 
 Triple = tuple[float, float, float]
@@ -122,7 +122,7 @@ class Development:
     exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        check.integer("Development", "samples", self.samples, low=1, high=4096)
+        check.integer("Development", "samples", self.samples, low=1, high=65536)
         checked_curve("Development", self.tone, self.exposure)
 
     def develop(self, picture: Picture) -> Picture:
@@ -130,6 +130,12 @@ class Development:
         if self.tone == "none" and self.exposure == 0:
             return picture
         return picture.tone_map(self.tone, exposure=self.exposure)
+
+    def take(self, render: Callable[[Camera], Picture], camera: Camera) -> Picture:
+        """Renders the picture of a camera at rest: the mean of all samples, developed."""
+        if self.samples == 1:
+            return self.develop(render(camera))
+        return self.develop(Progressive(render).refine(camera, self.samples))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,10 +227,36 @@ class ViewState:
         renderer = what.render if isinstance(what, Engine) else partial(render, what)
         return self.taken(renderer, self.camera.camera(width, height, what.box))
 
-    def taken(self, drawn: Callable[..., Picture], camera: Camera) -> Picture:
-        """Renders the picture at rest; `drawn` takes the camera, and by name shader and options."""
-        renderer = partial(drawn, shader=self.shader, **self.settings())
-        return self.develop.develop(Progressive(renderer).refine(camera, self.develop.samples))
+    def taken(self, render: Callable[..., Picture], camera: Camera) -> Picture:
+        """Renders the picture at rest; `render` takes the camera, and by name shader and options.
+        It is without costs and planes, see `with_costs` and `Planes.composed`.
+        """
+        renderer = partial(render, shader=self.shader, **self.settings())
+        return self.develop.take(renderer, camera)
+
+    def cost_picture(self, cost: Callable[..., Cost], camera: Camera) -> Picture:
+        """Renders the costs that `show` names, in false colours; `cost` takes the camera, and by
+        name shader and options. The shader's transfer function stands for the shader, unlit.
+
+        Raises:
+            ValueError: The shader has no transfer function.
+        """
+        assert self.show != "picture"
+        settings = {**self.settings(), "lighting": None}
+        return cost(camera, shader=costed(self.shader), **settings).picture(self.show)
+
+    def with_costs(self, picture: Callable[[], Picture], costs: Callable[[], Picture]) -> Picture:
+        """Returns the developed picture, or costs in its place or blended over it, as the state
+        says. Calls only what it needs.
+        """
+        if self.show == "picture":
+            return picture()
+        top = costs()
+        if self.blend == 1:
+            return top
+        below = picture()
+        weight = self.blend * top.alpha.to(below.color)
+        return replace(top, color=torch.lerp(below.color, top.color.to(below.color), weight))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the state as plain values, ready for JSON."""
@@ -284,11 +316,3 @@ def saved_state(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("options", {}), dict):
         raise ValueError(f"{path}: not a state: it must be an object with the state's fields")
     return content
-
-
-def blended(picture: Picture, cost: Picture, fraction: float) -> Picture:
-    """Returns a cost picture, blended by `fraction` over the picture (1: alone); both developed."""
-    if fraction == 1:
-        return cost
-    weight = fraction * cost.alpha.to(picture.color)
-    return replace(cost, color=torch.lerp(picture.color, cost.color.to(picture.color), weight))
