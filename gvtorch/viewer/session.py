@@ -18,6 +18,7 @@ import torch
 from ..base.messages import one_line
 from ..base.volume import Volume
 from ..cameras import Camera
+from ..cameras.models import MODELS
 from ..cameras.poses import Up, upward
 from ..engine import EngineOptions
 from ..io.stores.store import Store
@@ -289,6 +290,10 @@ class Session:
             },
             **self._state_content(),
             schema=schema(),
+            models={
+                name: {"parallel": model.parallel, "planar": model.planar}
+                for name, model in MODELS.items()
+            },
             presets=[*PRESETS, *CT_PRESETS, *_COLOR_MAPS],
             engine=None
             if engine is None or self.scene.remake is None

@@ -96,8 +96,8 @@ class Eye:
             distance = half_height / math.tan(math.radians(fov / 2))
             eye = eye + forward * (float((box.mean(0) - eye) @ forward) - distance)
         else:
-            is_angular = model in ("fisheye", "panorama")
-            fov = math.degrees(2 * half_height if is_angular else 2 * math.atan(half_height))
+            is_planar = MODELS[model].planar
+            fov = math.degrees(2 * math.atan(half_height) if is_planar else 2 * half_height)
         target = eye + distance * forward
         triples = (tuple(vector.tolist()) for vector in (eye, target, -rotation[1]))
         return cls(
