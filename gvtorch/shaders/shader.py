@@ -240,7 +240,8 @@ class Shader(Checked):
             other_component=self.other_component,
         )
 
-    # For the effects around it. Those for lighting raise ValueError for unsuitable shaders.
+    # Methods that the effects (clip, lens, lighting) call. `unlit`, `matter` and `blocker` raise
+    # ValueError if the shader can't be lit.
 
     @property
     def shows_nothing(self) -> bool:

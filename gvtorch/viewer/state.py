@@ -20,6 +20,7 @@ from ..base.messages import one_line
 from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
+from ..cameras.poses import Up, upward
 from ..engine import Engine
 from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
@@ -105,6 +106,22 @@ class Eye:
             fov=round(fov, 9),
             model=model,
         )
+
+    @classmethod
+    def first(cls, box: Tensor, width: int, height: int, up: Up = "+y") -> Self:
+        """Returns the default eye: it sees the whole (2, 3) box, in a picture of such a shape."""
+        camera = Camera.orbit(30, 20, width=width, height=height, up=up, fit=True)
+        return replace(cls.of(camera, box), up=tuple(upward("view", up).tolist()))
+
+    def fitted(self, box: Tensor, width: int, height: int) -> Self:
+        """Returns the eye that looks the same way and sees the whole (2, 3) box."""
+        forward = torch.tensor(self.target) - torch.tensor(self.eye)
+        centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
+        half_angle = torch.deg2rad(torch.tensor(min(self.fov, 100.0))) / 2
+        aspect = min(1.0, max(1, width) / max(1, height))
+        distance = radius / max(1e-3, float(half_angle.sin())) / aspect
+        position = centre - forward.double() / forward.norm() * distance
+        return replace(self, eye=tuple(position.tolist()), target=tuple(centre.tolist()))
 
 
 @dataclass(frozen=True, kw_only=True)
