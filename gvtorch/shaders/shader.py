@@ -293,6 +293,15 @@ def one_color(color: Triple, sampling: Sampling) -> ColorTable:
     )
 
 
+def row_and_fraction(position: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Returns for positions in a table of `count` rows (0: the first), clamped to it, the int64 row
+    before each, at most the last but one, and the fraction, 0 to 1, of the way to the next row.
+    """
+    position = position.clamp(0, count - 1)
+    row = position.to(torch.int64).clamp(max=count - 2)
+    return row, position - row
+
+
 def interval_levels(root_voxel: float, step: float) -> int:
     """Returns how many interval lengths a tree needs, up to the side of a voxel of its root."""
     return max(1, math.ceil(math.log2(root_voxel / step)) + 1)
