@@ -43,7 +43,7 @@ class ColorField(nn.Module):
         return {"rgba": torch.cat((color * alpha, alpha), -1)}
 
     def picture(self, width, height, extent, device):
-        producer = gv.cache_field(self.to(device), extent, box=BOX, samples=1, threshold=0.0)
+        producer = gv.FieldProducer(self.to(device), extent, box=BOX, samples=1, threshold=0.0)
         engine = gv.Engine(producer, device=device)
         for divisor, mode in ((4, "converge"), (1, "interactive")):
             camera = gv.Camera.orbit(32, 24, 1.36, 34, width // divisor, height // divisor)

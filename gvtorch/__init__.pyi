@@ -61,7 +61,6 @@ from .producers import (
     StoredChannels as StoredChannels,
     StoredProducer as StoredProducer,
     VolumeProducer as VolumeProducer,
-    cache_field as cache_field,
 )
 
 # Cameras and rays.

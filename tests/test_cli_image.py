@@ -11,6 +11,7 @@ from helpers import gvtorch
 from PIL import Image
 
 import gvtorch as gv
+from gvtorch.tools.annotations import Annotations
 from gvtorch.viewer.state import ViewState
 
 LOOK = ("--size", "24x16", "--tf", "hot", "--camera", "orbit:20,10,0.8")
@@ -148,6 +149,8 @@ def others(small, tmp_path):
         ("view v.npy --state list.json", "list.json: not a state"),
         ("render v.npy -o sky.exr --background sky.exr", "written over what --background reads"),
         ("view v.npy --state s.json --camera orbit:0,0", "--state sets what --camera sets"),
+        ("render v.npy -o a.png --state s.json --camera orbit:0,0", "--state sets what --camera"),
+        ("render v.npy -o a.png --state t.json --samples 2", "--state sets what --samples sets"),
         ("view a.py --threshold 3", "--threshold is for files: the script sets it"),
         ("view v.npy --port 99999 --no-browser", "port must be an int >= 0 and <= 65535"),
         ("render v.npy -o a.png --camera file:c.pvcc --camera-model fisheye", "--camera-model"),
@@ -175,3 +178,46 @@ def test_a_state_leaves_the_flags_be_that_it_does_not_tell(others):
         assert done.returncode == 0, done.stderr
         pictures.append(np.asarray(Image.open(others / "a.png")))
     assert np.array_equal(*pictures[:2]) and not np.array_equal(*pictures[1:])
+
+
+def test_a_state_without_a_camera_takes_that_of_the_flags(others, monkeypatch):
+    """t.json has `camera: null`, part.json does not name it."""
+    (others / "part.json").write_text('{"develop": {"samples": 1}}')
+    for state in ("t.json", "part.json"):
+        pictures = []
+        for camera in ("orbit:80,20", "orbit:10,50,0.7"):
+            flags = ("--state", state, "--camera", camera, "--size", "24x16")
+            done = gvtorch("render", "v.npy", "-o", "a.png", *flags, cwd=others)
+            assert done.returncode == 0, done.stderr
+            pictures.append(np.asarray(Image.open(others / "a.png")))
+        assert pictures[0].std() > 5 and not np.array_equal(*pictures)
+    cameras = []
+    monkeypatch.setattr("gvtorch.viewer.view", lambda *args, **_: cameras.append(args[2]))
+    for state in ("t.json", "part.json"):
+        done = gvtorch(
+            "view", "v.npy", "--state", state, "--camera", "look:9,9,9,1,2,3", cwd=others
+        )
+        assert done.returncode == 0, done.stderr
+    expected = gv.Camera.look_at((9, 9, 9), (1, 2, 3), "+y", None, 16, 9)
+    assert len(cameras) == 2 and all(camera.same(expected) for camera in cameras)
+
+
+def test_a_saved_component_is_that_of_the_bar_and_of_warnings(tmp_path, monkeypatch):
+    """The second channel is shown: the bar is named after it, and a store warns of its range."""
+    data = np.zeros((2, 8, 8, 8), np.float32)
+    data[1, 2:6, 2:6, 2:6] = 7
+    np.save(tmp_path / "v.npy", data)
+    done = gvtorch("convert", "v.npy", "v.zarr", "--axes", "czyx", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    shader = gv.TransferFunction([(100, 0), (200, 1)])
+    ViewState(shader=shader, component=1).save(tmp_path / "s.json")
+    seen, overlay = [], Annotations.overlay
+    monkeypatch.setattr(
+        Annotations,
+        "overlay",
+        lambda self, *args: seen.append(args[2]) or overlay(self, *args),
+    )
+    common = ("--state", "s.json", "--size", "96x64", "-o", "a.png")
+    done = gvtorch("render", "v.zarr", *common, "--bar", cwd=tmp_path)
+    assert done.returncode == 0 and seen == [1], done.stderr
+    assert "nothing is seen: values range from 0 to 7" in done.stderr

@@ -265,7 +265,7 @@ def test_a_network_becomes_a_producer():
     """Any module can: here one whose values at the voxels' centres are known."""
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(3, 16), torch.nn.Tanh(), torch.nn.Linear(16, 2))
-    producer = gv.cache_field(network, 16, box=BOX, samples=1)
+    producer = gv.FieldProducer(network, 16, box=BOX, samples=1)
     assert producer.channels == {"value": gv.Channel(torch.float32, 2)}
     points = random_points(50).float()
     assert torch.equal(producer.at(points)["value"], network(points))

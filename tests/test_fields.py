@@ -131,7 +131,7 @@ def test_infinite_values_fail_and_halves_do_not():
             "FieldProducer: field must be a field, got ModuleList, which has no forward",
         ),
         (
-            lambda: gv.cache_field(torch.nn.Linear(2, 1), box=BOX),
+            lambda: gv.FieldProducer(torch.nn.Linear(2, 1), box=BOX),
             "FieldProducer: field Linear failed: RuntimeError: mat1 and mat2 shapes cannot be mult",
         ),
         (lambda: gv.FieldProducer(Waves()), "box must be given: the field does not say"),

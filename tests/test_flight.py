@@ -387,3 +387,20 @@ def test_a_film_of_keys_is_streamed_as_it_is_resident(scan_store, tmp_path):
     assert np.array_equal(again, pixels((tmp_path / "s" / "0001.png").read_bytes()))
     with pytest.raises(ValueError, match="must have a camera"):
         gv.ViewState(shader=HOT).picture(tree, 8, 8)
+
+
+@pytest.mark.backend("cpp")
+def test_costs_in_a_film_lie_over_the_picture_as_in_a_still(scan_store, tmp_path):
+    """For a store too, whose costs are those of the data that the picture loaded."""
+    eye = Eye(eye=(150, 40, 56), target=(20, 24, 56), up=(0, 0, 1))
+    saved = ("--state", tmp_path / "v.json", "--size", "40x30")
+    for blend, shader in ((1.0, HOT), (0.4, gv.Lit(HOT))):
+        gv.ViewState(shader=shader, camera=eye, show="samples", blend=blend).save(
+            tmp_path / "v.json"
+        )
+        run = gvtorch("fly", scan_store, "-o", tmp_path / "f", *saved, "--frames", "1")
+        assert run.returncode == 0, run.stderr
+        run = gvtorch("render", scan_store, "-o", tmp_path / "one.png", *saved)
+        assert run.returncode == 0, run.stderr
+        seen = pixels((tmp_path / "f" / "0000.png").read_bytes())
+        assert np.array_equal(seen, pixels((tmp_path / "one.png").read_bytes())) and seen.std() > 5

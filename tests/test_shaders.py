@@ -442,6 +442,10 @@ def test_faint_moments_are_divided_and_multiplied_by_the_same_number():
     assert mean_of_directions(written)[4:].tolist() == [1 / FAINT] * 6
 
 
+def test_each_shader_of_the_command_line_has_its_line_of_help():
+    assert list(built_in.HELP) == list(built_in.BY_NAME)
+
+
 @pytest.mark.parametrize("name", built_in.BY_NAME)
 def test_every_named_shader_draws(tree, name):
     """The shaders of the command line need only a transfer function and a level."""

@@ -230,8 +230,9 @@ def test_render_makes_the_picture_of_a_state_with_slices_and_cost(tmp_path):
         ("coloured", {"slices": Slices(colors="shader")}),
         ("blend", {"show": "samples", "blend": 0.4}),
         ("both", {"show": "nodes", "blend": 0.5, "slices": Slices()}),
+        ("lit", {"show": "samples", "blend": 0.4, "shader": gv.Lit(FUNCTION)}),
     ):
-        state = gv.ViewState(**common, **more)
+        state = gv.ViewState(**{**common, **more})
         state.save(tmp_path / "view.json")
         run = gvtorch(
             *("render", tmp_path / "ball.npy", "-o", tmp_path / "a.png", "--size", "120x90"),

@@ -1,5 +1,6 @@
-"""`declared_names`: names that a module declares, read without importing it, so that
-`gvtorch --help` does not wait for torch. `did_you_mean`: suggestions for a misspelt name.
+"""`declared_names` and `declared_texts`: names and texts that a module declares, read without
+importing it, so that `gvtorch --help` does not wait for torch. `did_you_mean`: suggestions for a
+misspelt name.
 """
 
 from __future__ import annotations
@@ -16,14 +17,25 @@ def declared_names(module: str, variable: str) -> list[str]:
     """Returns the items of the list of strings, or the keys of the dict, that a module (such as
     `shaders.built_in`) assigns to a variable once, at its top level.
     """
+    value = _assigned(module, variable)
+    assert isinstance(value, (ast.Dict, ast.List))
+    names = value.keys if isinstance(value, ast.Dict) else value.elts
+    return [ast.literal_eval(name) for name in names if name is not None]
+
+
+def declared_texts(module: str, variable: str) -> dict[str, str]:
+    """Returns the dict of strings that a module assigns to a variable, likewise."""
+    return ast.literal_eval(_assigned(module, variable))
+
+
+def _assigned(module: str, variable: str) -> ast.expr:
+    """Returns the expression that a module assigns to a variable at its top level."""
     path = _PACKAGE.joinpath(*module.split(".")).with_suffix(".py")
     for node in ast.parse(path.read_text("utf-8")).body:
         if isinstance(node, (ast.Assign, ast.AnnAssign)):
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-            if isinstance(target, ast.Name) and target.id == variable:
-                assert isinstance(node.value, (ast.Dict, ast.List))
-                names = node.value.keys if isinstance(node.value, ast.Dict) else node.value.elts
-                return [ast.literal_eval(name) for name in names if name is not None]
+            if isinstance(target, ast.Name) and target.id == variable and node.value is not None:
+                return node.value
     raise KeyError(f"{module} has no {variable}")
 
 

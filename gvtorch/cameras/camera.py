@@ -359,13 +359,13 @@ class Camera:
         Raises:
             ValueError: It is a fisheye or a panorama, a batch, or relative to a box.
         """
-        context, in_world = "Camera.pixel_width", self.frame is Coordinates.WORLD
-        if self.model not in ("pinhole", "ortho") or len(self) != 1 or not in_world:
+        context, model = "Camera.pixel_width", MODELS[self.model]
+        if not model.planar or len(self) != 1 or self.frame is not Coordinates.WORLD:
             raise ValueError(
                 f"{context}: takes one pinhole or ortho camera in the world, got {self}"
             )
         distance = check.number(context, "distance", distance, low=0, open_low=True)
-        return (1.0 if self.model == "ortho" else distance) / float(self.Ks[0, 0, 0])
+        return (1.0 if model.parallel else distance) / float(self.Ks[0, 0, 0])
 
     def shifted(self, dx: float, dy: float, sample: int | None = None) -> Camera:
         """Returns the camera whose rays pass (dx, dy) pixels to the right of and below the centres

@@ -131,12 +131,15 @@ class Model(ABC):
         fov: Default vertical field of view, degrees.
         widest: Largest vertical field of view, degrees.
         parallel: Rays are parallel; focal lengths are pixels per world unit, and cones do not grow.
+        planar: The image is a plane: all pixels are equally wide at a distance along the axis.
+            Else its focal lengths are pixels per radian.
         has_distortion: Radial coefficients and a largest angle to the axis are allowed.
     """
 
     fov = 30.0
     widest = 179.0
     parallel = False
+    planar = True
     has_distortion = False
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
@@ -199,7 +202,7 @@ class Fisheye(Model):
     wide-angle, and fish-eye lenses", PAMI 2006, eq. 6; OpenCV's fisheye model.
     """
 
-    fov, widest, has_distortion = 180.0, 360.0, True
+    fov, widest, planar, has_distortion = 180.0, 360.0, False, True
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """A unit of the image plane is a radian."""
@@ -230,7 +233,7 @@ class Fisheye(Model):
 class Panorama(Model):
     """Equirectangular: x is the longitude and y the latitude (down), in radians."""
 
-    fov, widest = 180.0, 180.0
+    fov, widest, planar = 180.0, 180.0, False
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """A unit of the image plane is a radian; a picture spans twice the angle horizontally."""

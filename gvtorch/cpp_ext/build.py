@@ -127,7 +127,9 @@ class BuildExt(build_ext):
     """Puts the libraries into cpp_ext/lib, in the source tree and in the wheel."""
 
     def run(self) -> None:
-        """Compiles in the source tree, where the next build finds them, and copies from there."""
+        """Compiles the libraries in the source tree, where the next build can reuse them, then
+        copies them into the wheel.
+        """
         if os.environ.get("GVTORCH_COMPILE") == "0":
             return
         libraries = compile_libraries(FOLDER / "lib")

@@ -29,11 +29,11 @@ from ..cache.write import (
 )
 from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
-from .mail import Mail, RowForm
 from .production import Production
 from .recorded import RecordedFrame, SlotCounts
 from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import Collected, FrameStats
+from .upload_queue import RowForm, UploadQueue
 
 _CALL_GAP = 0.02  # seconds after which a late answer no longer delays the next call
 
@@ -45,14 +45,16 @@ class HostFrame(RecordedFrame):
     all nodes chosen since its last call, once that call is answered: a busy host gets the nodes of
     several frames at once, so that it catches up. If an answer takes longer than `_CALL_GAP`, it
     calls without waiting: one slow read delays nothing else. The thread in which an answer arrives
-    checks and posts it; the next frame sends all posted answers, and writes them.
+    checks and queues it; the next frame sends all queued answers, and writes them.
     """
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
         super().__init__(production, batch, fit)
         device = self._unused_slots.device
-        self._mail = [Mail(_box_forms(self.cache, source), batch, device) for source in self.trees]
-        self._mail_index = {source.tree.number: index for index, source in enumerate(self.trees)}
+        self._uploads = [
+            UploadQueue(_table_forms(self.cache, source), batch, device) for source in self.trees
+        ]
+        self._upload_index = {source.tree.number: index for index, source in enumerate(self.trees)}
         self.generation = 0  # counts releases: answers to requests of an earlier one are dropped
         # Nodes asked for, and failed, since the last `release`.
         self._asked_count = self._failed_count = 0
@@ -68,11 +70,12 @@ class HostFrame(RecordedFrame):
     def pending(self) -> int:
         """Number of nodes whose answers are on their way."""
         return max(
-            0, self._asked_count - self._failed_count - sum(mail.sent for mail in self._mail)
+            0,
+            self._asked_count - self._failed_count - sum(queue.sent for queue in self._uploads),
         )
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
-        """Sends the answers that were posted, and returns whether there are any; see
+        """Sends the answers that were queued, and returns whether there are any; see
         `RecordedFrame`.
         """
         self.active = True
@@ -80,7 +83,7 @@ class HostFrame(RecordedFrame):
             self._unused_slots.zero_()  # the counts are out of date
         self._fail_overdue()
         self._schedule_ask()
-        sent = [mail.send() for mail in self._mail]
+        sent = [queue.send() for queue in self._uploads]
         stats.pending, stats.failed = self.pending, len(self._production.failures)
         return any(sent)
 
@@ -89,16 +92,16 @@ class HostFrame(RecordedFrame):
         if not self.active:
             return
         self.active = False
-        # An answer being processed is either posted before the lock is held, and dropped below, or
-        # posted later, and refused because its generation is over.
+        # An answer being processed is either queued before the lock is held, and dropped below, or
+        # queued later, and refused because its generation is over.
         with self._lock:
             self._waiting.clear()
             self.generation += 1
             for rows in self._chosen.values():
                 rows.clear()
-            for mail in self._mail:
-                mail.forget()
-                mail.sent = 0
+            for queue in self._uploads:
+                queue.forget()
+                queue.sent = 0
             self._asked_count = self._failed_count = 0
         self._production.restore_pending()
 
@@ -108,8 +111,8 @@ class HostFrame(RecordedFrame):
 
     def serve(self) -> None:
         """Writes the answers that were sent."""
-        for source, mail in zip(self.trees, self._mail, strict=True):
-            self._write_answers(source, mail)
+        for source, queue in zip(self.trees, self._uploads, strict=True):
+            self._write_answers(source, queue)
 
     def finish(self, hits: Hits) -> Collected:
         """Ends a frame as `RecordedFrame.finish` does, then chooses the nodes that producers are
@@ -132,10 +135,10 @@ class HostFrame(RecordedFrame):
     def to_read_back(self, collected: Collected) -> Collected:
         return collected._replace(ask=partial(self.ask, self.generation))
 
-    def _write_answers(self, source: ProducedTree, mail: Mail) -> None:
+    def _write_answers(self, source: ProducedTree, queue: UploadQueue) -> None:
         """Writes the answers sent for one tree; nodes that found no slot may be requested again."""
         tiles, bricks, uniform, to_host = (
-            mail.device_boxes[box] for box in ("tiles", "bricks", "uniform", "to_host")
+            queue.device_tables[table] for table in ("tiles", "bricks", "uniform", "to_host")
         )
         children = Children(
             child=tiles["child"],
@@ -147,7 +150,7 @@ class HostFrame(RecordedFrame):
             alias_tree=source.tree.number,
         )
         targets = [
-            Targets(source.tree, box["node"], box["loc"]) for box in (tiles, bricks, uniform)
+            Targets(source.tree, table["node"], table["loc"]) for table in (tiles, bricks, uniform)
         ]
         outcome = put_tiles(self.cache, targets[0], children, self._tiles.unused)
         self._count_outcome(REQUEST_SUBDIVIDE, self._tiles, targets[0], outcome)
@@ -158,7 +161,7 @@ class HostFrame(RecordedFrame):
         constants = _by_channel(uniform, "constants")
         self._uniform_nodes.add_(put_uniform(self.cache, targets[2], uniform["word"], constants))
         self._clear_pending(to_host["node"], to_host["bit"])
-        mail.clear()
+        queue.clear()
 
     def _count_outcome(
         self, kind: int, slots: SlotCounts, targets: Targets, outcome: WriteOutcome
@@ -262,7 +265,7 @@ class HostFrame(RecordedFrame):
             self._submit(half)
 
     def _settle(self, batch: RequestBatch, get_answer: Callable[[], Any]) -> None:
-        """Checks an answer and posts it, in the thread in which it arrives."""
+        """Checks an answer and queues it, in the thread in which it arrives."""
         try:
             answer = get_answer()
         except CancelledError:
@@ -277,9 +280,9 @@ class HostFrame(RecordedFrame):
                 self._fail(batch[index : index + 1], message)
             kept_index = kept.nonzero()[:, 0]
             if isinstance(checked, Regions):
-                self._post_tiles(batch, checked, kept_index)
+                self._queue_tiles(batch, checked, kept_index)
             else:
-                self._post_bricks(batch, checked, kept_index)
+                self._queue_bricks(batch, checked, kept_index)
         except ValueError as error:
             self._fail(batch, str(error), error)
 
@@ -290,7 +293,7 @@ class HostFrame(RecordedFrame):
                 self._failed_count += len(batch)
                 self._production.failures.add(batch, message, cause)
 
-    def _post_tiles(self, batch: RequestBatch, answer: Regions, kept_index: Tensor) -> None:
+    def _queue_tiles(self, batch: RequestBatch, answer: Regions, kept_index: Tensor) -> None:
         if answer.alias is not None:
             self._leave_to_host(batch[kept_index])
             return
@@ -302,9 +305,9 @@ class HostFrame(RecordedFrame):
             "brick": children.brick,
         }
         fields = {"constants": children.constants, "ranges": children.ranges}
-        self._post(batch, "tiles", rows, fields, kept_index)
+        self._queue(batch, "tiles", rows, fields, kept_index)
 
-    def _post_bricks(self, batch: RequestBatch, answer: Bricks, kept_index: Tensor) -> None:
+    def _queue_bricks(self, batch: RequestBatch, answer: Bricks, kept_index: Tensor) -> None:
         fields: dict[str, Mapping[str, Any]]
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
@@ -314,36 +317,36 @@ class HostFrame(RecordedFrame):
         }
         fields = {"data": data}
         if kind is None:
-            self._post(batch, "bricks", rows, fields, kept_index)
+            self._queue(batch, "bricks", rows, fields, kept_index)
             return
         is_alias = kind[kept_index] == Region.ALIAS
         if bool(is_alias.any()):
             self._leave_to_host(batch[kept_index[is_alias]])
         brick_word = brick_words(kind)
         is_uniform = brick_word[kept_index] != ABSENT
-        self._post(batch, "bricks", rows, fields, kept_index[~is_uniform & ~is_alias])
+        self._queue(batch, "bricks", rows, fields, kept_index[~is_uniform & ~is_alias])
         zeros = {
             name: torch.zeros((len(kind), channel.width), dtype=channel.dtype)
             for name, channel in batch.source.producer.channels.items()
         }
         fields = {"constants": {**zeros, **answer.constants}}
-        self._post(batch, "uniform", {**rows, "word": brick_word}, fields, kept_index[is_uniform])
+        self._queue(batch, "uniform", {**rows, "word": brick_word}, fields, kept_index[is_uniform])
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
-        self._post(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+        self._queue(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
 
-    def _post(
+    def _queue(
         self,
         batch: RequestBatch,
-        box: str,
+        table: str,
         rows: Mapping[str, Tensor],
         fields: Mapping[str, Mapping[str, Tensor]],
         index: Tensor | slice,
     ) -> None:
-        """Posts entries `index` of `rows`, and of `fields` by channel. A node may be posted only
+        """Queues entries `index` of `rows`, and of `fields` by channel. A node may be queued only
         once; those of an earlier generation are dropped: they may have been requested again.
         """
         flat_fields = {
@@ -351,18 +354,18 @@ class HostFrame(RecordedFrame):
             for name, by_channel in fields.items()
             for channel, values in by_channel.items()
         }
-        mail = self._mail[self._mail_index[batch.source.tree.number]]
-        posted = {
+        queue = self._uploads[self._upload_index[batch.source.tree.number]]
+        selected = {
             name: movable(values)[index].view(values.dtype)
             for name, values in {**rows, **flat_fields}.items()
         }
         with self._lock:
             if batch.generation == self.generation:
-                mail.post(box, posted)
+                queue.add(table, selected)
 
 
-def _box_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:
-    """Returns the boxes of a tree's mail, and the fields of their rows."""
+def _table_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:
+    """Returns the tables of a tree's answers, and the fields of their rows."""
     word_dtype, loc_field = torch.int32, {"loc": ((4,), torch.int64)}
     channels, child_count = source.producer.channels, source.layout.branching**3
     pool_channels = cache.bricks.channels
@@ -391,7 +394,7 @@ def _box_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:
     }
 
 
-def _by_channel(box: Mapping[str, Tensor], field: str) -> dict[str, Tensor]:
-    """Returns a field of a box by channel."""
-    parts = (name.partition(".") for name in box)
-    return {channel: box[f"{field}.{channel}"] for name, _, channel in parts if name == field}
+def _by_channel(table: Mapping[str, Tensor], field: str) -> dict[str, Tensor]:
+    """Returns a field of a table by channel."""
+    parts = (name.partition(".") for name in table)
+    return {channel: table[f"{field}.{channel}"] for name, _, channel in parts if name == field}

@@ -250,6 +250,9 @@ FAKES: dict[str, Callable[..., Any]] = {
 }
 
 
+#: Ops that return floats of inputs that may require a gradient, and have no backward.
+WITHOUT_GRADIENTS = ("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds")
+
 _libraries: dict[str, torch.library.Library] = {}  # kernels last as long as these
 
 
@@ -322,7 +325,7 @@ _reasons = cpp_ext.load()
 if not _reasons["cpp"]:
     for _name, _fake in FAKES.items():
         _register_fake(getattr(torch.ops.gvtorch, _name), _fake)
-    for _name in ("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds"):
+    for _name in WITHOUT_GRADIENTS:
         _refuse_gradients(getattr(torch.ops.gvtorch, _name))
     torch.library.register_autograd(
         "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples

@@ -1,7 +1,7 @@
 """Producers: they make the content of trees."""
 
 from .children import FromChildren
-from .field import FieldProducer, cache_field
+from .field import FieldProducer
 from .hypertexture import Hypertexture
 from .joined import JoinedProducer, StoredChannels
 from .mesh import MeshProducer
@@ -28,5 +28,4 @@ __all__ = [
     "StoredChannels",
     "StoredProducer",
     "VolumeProducer",
-    "cache_field",
 ]

@@ -248,15 +248,6 @@ class FieldProducer(Producer):
         return (values * high).round().clamp(low, high).to(channel.dtype)
 
 
-def cache_field(
-    field: nn.Module, extent: int | Sequence[int] = 1024, **options: Any
-) -> FieldProducer:
-    """Returns a producer for any module from positions (..., 3) to values (..., c), or to these by
-    channel, such as a network: the engine caches what rays ask for. Arguments as `FieldProducer`.
-    """
-    return FieldProducer(field, extent, **options)
-
-
 def interval_of(field: nn.Module, name: str, ends: Any, count: int, width: int) -> Interval:
     """Returns the interval that a field's `bounds` returned for a channel of `width` numbers, as
     (k, width) each, k = `count`; raises ValueError if it is not one.

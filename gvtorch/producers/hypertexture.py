@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.boxes import extent_in
 from ..fields import Distance, noise
-from ..fields.noise.fractal import Octave, Tally, octaves_of
+from ..fields.noise.fractal import EvaluationCounter, Octave, octaves_of
 from ..pool import Channel
 from .field import distances_of, group_alike, interval_of, moving_nodes, position_dtype
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
@@ -36,7 +36,7 @@ class LevelOctaves(NamedTuple):
     side: float  # of a voxel, world units
 
 
-class Hypertexture(Tally, Producer):
+class Hypertexture(EvaluationCounter, Producer):
     """Density around a shape's surface:
 
         density = smoothstep(1/2 - softness, 1/2 + softness)(s),

@@ -493,6 +493,17 @@ BY_NAME: Mapping[str, Callable[[TransferFunction, float], Shader]] = {
     "mean": lambda transfer, _: Projection("mean", transfer),
     "gradient": lambda transfer, _: GradientMagnitude(transfer),
 }
+#: What each of them shows, for the help of `--shader`.
+HELP = {
+    "plain": "transfer function alone",
+    "lit": "with lighting",
+    "preintegrated": "plain, but keeps thin peaks of the function",
+    "isosurface": "surface at --value",
+    "maximum": "of the values along each ray",
+    "minimum": "of the values along each ray",
+    "mean": "of the values along each ray",
+    "gradient": "boundaries",
+}
 
 
 def _projection(which: Any) -> str:

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..base.stage import Progress
 from ..base.volume import DIRECTIONS, Volume, movable
 from ..ops.shading import COLOR_WIDTH, FAINT, LIT_COLOR_WIDTH
-from .shader import ColorTable
+from .shader import ColorTable, row_and_fraction
 
 _TILE_VOXELS = {"cpu": 1 << 17, "cuda": 1 << 20}  # finest voxels that are processed at a time
 _MIN_LIGHT = 0.001  # weight of a column that no light reaches
@@ -341,9 +341,8 @@ class _Painter:
         values = _upsampled(padded_values)
         low, high = self.table.domain_2
         rows = self.table.table_lm4[0]
-        row_position = ((values - low) * ((len(rows) - 1) / (high - low))).clamp(0, len(rows) - 1)
-        row = row_position.to(torch.int64).clamp(max=len(rows) - 2)
-        fraction = row_position - row
+        row_position = (values - low) * ((len(rows) - 1) / (high - low))
+        row, fraction = row_and_fraction(row_position, len(rows))
         rgba = [
             torch.lerp(column[row], column[row + 1], fraction) for column in rows.T.contiguous()
         ]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.checked import Check, instance_of, optional, whole_between
-from .shader import ColorTable, Sampling, Shader
+from .shader import ColorTable, Sampling, Shader, row_and_fraction
 from .transfer_function import TransferFunction
 
 #: Samples of one ray that are shaded at once; therefore the minimum of `ModuleShader.samples`.
@@ -148,14 +148,13 @@ class TransferModule(torch.nn.Module):
         self, values: Tensor, positions: Tensor, directions: Tensor, lengths: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Returns colour (k, 3) and alpha (k, 1) of the first channel's first number."""
-        last = len(self.rows) - 1
-        row_position = ((values[:, :1] - self.low) * self.scale).clamp(0, last)
-        row = row_position.long().clamp(max=last - 1)
+        row_position = (values[:, :1] - self.low) * self.scale
+        row, fraction = row_and_fraction(row_position, len(self.rows))
         rows = self.rows.to(values.dtype)
         a, b = rows[row[:, 0]], rows[row[:, 0] + 1]
-        rgb = a[:, :3] + (row_position - row) * (b[:, :3] - a[:, :3])
+        rgb = a[:, :3] + fraction * (b[:, :3] - a[:, :3])
         alpha_a, alpha_b = (
             -torch.expm1(lengths / self.reference * torch.log1p(-side[:, 3:].clamp(0, 1 - 2**-23)))
             for side in (a, b)
         )
-        return rgb, alpha_a + (row_position - row) * (alpha_b - alpha_a)
+        return rgb, alpha_a + fraction * (alpha_b - alpha_a)

@@ -240,7 +240,8 @@ class Shader(Checked):
             other_component=self.other_component,
         )
 
-    # For the effects around it. Those for lighting raise ValueError for unsuitable shaders.
+    # Methods that the effects (clip, lens, lighting) call. `unlit`, `matter` and `blocker` raise
+    # ValueError if the shader can't be lit.
 
     @property
     def shows_nothing(self) -> bool:
@@ -290,6 +291,15 @@ def one_color(color: Triple, sampling: Sampling) -> ColorTable:
         domain_2=pack((0.0, 1.0), sampling.dtype, sampling.device),
         opaque_m=torch.arange(1, 3, dtype=torch.int32, device=sampling.device),
     )
+
+
+def row_and_fraction(position: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Returns for positions in a table of `count` rows (0: the first), clamped to it, the int64 row
+    before each, at most the last but one, and the fraction, 0 to 1, of the way to the next row.
+    """
+    position = position.clamp(0, count - 1)
+    row = position.to(torch.int64).clamp(max=count - 2)
+    return row, position - row
 
 
 def interval_levels(root_voxel: float, step: float) -> int:

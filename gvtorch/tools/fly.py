@@ -340,9 +340,7 @@ class Fly:
         flags = [name for name, value in flag_values.items() if value]
         if self.times is not None and any(state.time != 0 for _, state in flight.keys):
             flags.append("--times")
-        flags += self.scene.look.flags_set_by(self._first_fields)
-        if flags:
-            raise ValueError(f"{self._state_flag} sets what {flags[0]} sets: leave one out")
+        self.scene.look.check_state(self._state_flag, self._first_fields, flags)
 
     @property
     def _state_flag(self) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from ..base.declared import declared_names
+from ..base.declared import declared_names, declared_texts
 from .common import given_flags, option, parse_numbers
 from .parse import (
     check_component,
@@ -45,7 +46,23 @@ _STATE_FIELDS = {  # fields that a part of a saved state sets too
     "camera": ("camera_model", "fov", "up"),
     "component": ("component",),
 }
-_WHOLE_RAY_SHADERS = ("isosurface", "maximum", "minimum", "mean")  # use one value, or a whole ray
+
+
+def _shader_help() -> str:
+    """Returns what each shader shows; equal texts in a row are told once."""
+    texts = declared_texts("shaders.built_in", "HELP")
+    parts = [", ".join(names) + f": {text}" for text, names in groupby(texts, texts.__getitem__)]
+    return "; ".join(
+        (
+            *parts,
+            "filtered, filtered-lit: as plain and lit, but correct from afar (stores need gvtorch "
+            "filter, or gvtorch filter --lit)",
+            "channels: all numbers of a voxel, see --channel",
+            "labels: one colour each, the default for labels",
+            "colors: those stored for a mesh, lit (by its normals, if stored), the default for "
+            "these",
+        )
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,13 +85,7 @@ class Look:
     # range); or auto (by the histogram, without its background); if left out: auto, except for ct-
     # presets and files with values of their own
     window: Annotated[str | None, option(metavar="LO,HI")] = None
-    # plain: transfer function alone; lit: with lighting; preintegrated: plain, but keeps thin peaks
-    # of the function; isosurface: surface at --value; maximum, minimum, mean: of the values along
-    # each ray; gradient: boundaries; filtered, filtered-lit: as plain and lit, but correct from
-    # afar (stores need gvtorch filter, or gvtorch filter --lit); channels: all numbers of a voxel,
-    # see --channel; labels: one colour each, the default for labels; colors: those stored for a
-    # mesh, lit (by its normals, if stored), the default for these
-    shader: ShaderName = "plain"
+    shader: Annotated[ShaderName, option(help=_shader_help())] = "plain"
     # channels to show with --shader channels: number or name, colour (a name or #RRGGBB) and
     # window; parts left out or auto come from the file, or are chosen; the item opacity makes
     # channels hide each other instead of adding up
@@ -116,7 +127,7 @@ class Look:
 
     def options(self) -> dict[str, Any]:
         """Returns fields of `RenderOptions`."""
-        if self.shader in _WHOLE_RAY_SHADERS and self.stop_alpha != Look().stop_alpha:
+        if self.stop_alpha != Look().stop_alpha and not self._accumulates():
             raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
         names = ("step", "lod", "stop_alpha", "component", "backend")
         return {
@@ -128,17 +139,42 @@ class Look:
             "lighting": None if self.lighting is None else parse_lighting(self.lighting),
         }
 
+    def _accumulates(self) -> bool:
+        """Whether colours add up along a ray, until its alpha reaches --stop-alpha."""
+        from ..shaders import TransferFunction
+        from ..shaders.built_in import BY_NAME
+
+        if self.shader not in BY_NAME:
+            return True
+        shader = BY_NAME[self.shader](TransferFunction([(0, 1)]), 0.0)
+        return shader.projection is None and shader.cut_surface() is None
+
     def files(self) -> dict[str, str | None]:
         """Returns the files that are read in addition to the volume, by flag."""
         return {"--tf": self.tf, "--background": self.background}
 
-    def flags_set_by(self, state: Mapping[str, Any]) -> list[str]:
-        """Returns the given flags that a saved state sets as well, so that they would have no
-        effect.
+    def check_state(
+        self,
+        state_flag: str,
+        state: Mapping[str, Any],
+        other_flags: Sequence[str] = (),
+        camera: str | None = None,
+    ) -> None:
+        """Raises ValueError if a flag would have no effect, because a saved state sets the same.
+
+        Args:
+            state_flag: The flag that gives the state.
+            state: The state's fields, unchecked.
+            other_flags: Further given flags that any state sets.
+            camera: Value of --camera.
         """
-        fields = {name for part, names in _STATE_FIELDS.items() if part in state for name in names}
+        parts = [part for part in _STATE_FIELDS if state.get(part) is not None]
+        fields = {name for part in parts for name in _STATE_FIELDS[part]}
         fields |= set(state.get("options", ()))
-        return [flag for flag in given_flags(self) if flag[2:].replace("-", "_") in fields]
+        flags = [*other_flags, *["--camera"] * (camera is not None and "camera" in parts)]
+        flags += [flag for flag in given_flags(self) if flag[2:].replace("-", "_") in fields]
+        if flags:
+            raise ValueError(f"{state_flag} sets what {flags[0]} sets: leave one out")
 
     def device(self) -> torch.device:
         """Returns the device that the backend needs; for auto, CUDA if it can be used."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..cameras import Camera
     from ..pictures import Overlay, Picture
-    from ..viewer.state import Eye, ViewState
+    from ..viewer.state import Development, ViewState
 
 PICTURE_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif")
 STRIP_SUFFIXES = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
@@ -33,7 +32,7 @@ STRIP_SUFFIXES = (".npy", ".tif")  # written strip by strip: the picture may be 
 
 @dataclass(frozen=True, kw_only=True)
 class DevelopmentFlags:
-    """How the picture is developed."""
+    """Rays per pixel, exposure and tone curve."""
 
     # rays per pixel, at different positions in it
     samples: Annotated[int, option(metavar="N")] = 1
@@ -42,25 +41,13 @@ class DevelopmentFlags:
     # multiply the light by 2^STOPS
     exposure: Annotated[float, option(metavar="STOPS")] = 0.0
 
-    def wrap(self, render: Callable[[Camera], Picture]) -> Callable[[Camera], Picture]:
-        """Returns a function that renders a camera with all samples, tone-mapped."""
+    def checked(self) -> Development:
+        """Returns the flags as a part of a state; raises ValueError if one is out of its range."""
         from ..base import check
-        from ..pictures import Progressive
-        from ..pictures.tone import checked_curve
+        from ..viewer.state import Development
 
         check.integer("render", "--samples", self.samples, low=1)
-        checked_curve("render", self.tone, self.exposure)
-
-        def developed(camera: Camera) -> Picture:
-            if self.samples > 1:
-                picture = Progressive(render).refine(camera, self.samples)
-            else:
-                picture = render(camera)
-            if self.tone == "none" and self.exposure == 0:
-                return picture
-            return picture.tone_map(self.tone, exposure=self.exposure)
-
-        return developed
+        return Development(**vars(self))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,15 +91,15 @@ class Render:
         width, height = parse_size(self.size)
         self._check()
         parse_camera(self.camera, look, width, height)
-        options = look.options()
+        options, development = look.options(), self.development.checked()
         flags = self._at_saved_time()
         with Bar() as bar, flags.open(self.path, options, bar) as scene:
+            state = scene.state(options)
             if self.state is None:
-                camera = parse_camera(self.camera, look, width, height, scene.info.space)
-                stats = self._write_picture(scene, camera, None, bar)
+                state = replace(state, develop=development, show=self.show)
             else:
-                state = scene.state(options).read(self.state)
-                stats = self._write_saved(scene, state, bar)
+                state = state.read(self.state)
+            stats = self._write_picture(scene, state, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": scene.data.extent}
             write_text(self.stats, json.dumps(content, indent=2) + "\n")
@@ -132,23 +119,15 @@ class Render:
             raise ValueError(f"{self.state}: time must be the number of a time point, got {time:g}")
         return replace(self.scene, source=replace(source, time=int(time))) if time else self.scene
 
-    def _check_state(self) -> None:
-        """Raises ValueError if a flag sets what a saved state sets."""
-        if self.state is None:
-            return
-        from ..viewer.state import saved_state
-
-        state = saved_state(self.state)
-        flags = self.scene.look.flags_set_by(state) + given_flags(self.development)
-        flags += ["--camera"] * (self.camera is not None) + ["--show"] * (self.show != "picture")
-        if flags:
-            raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
-
     def _check(self) -> None:
         """Raises ValueError or FileNotFoundError for wrong flags before the volume is read."""
-        self._check_state()
         from ..pictures.files import checked_path
+        from ..viewer.state import saved_state
 
+        if self.state is not None:
+            flags = given_flags(self.development) + ["--show"] * (self.show != "picture")
+            fields = saved_state(self.state)
+            self.scene.look.check_state("--state", fields, flags, self.camera)
         _check_suffix("--output", self.output, *PICTURE_SUFFIXES)
         if self.npz is not None:
             if self.output.suffix in STRIP_SUFFIXES:
@@ -169,59 +148,46 @@ class Render:
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
-    def _write_saved(self, scene: RenderedScene, state: ViewState, bar: Bar) -> RenderStats:
-        """Renders and writes the picture of a saved state, as a page shows it."""
+    def _camera(self, scene: RenderedScene, state: ViewState) -> Camera:
+        """Returns the camera of the state, or else that of --camera."""
         from ..viewer.slices import panes
 
-        if state.composed and (flags := given_flags(self.annotation)):
-            raise ValueError(f"{flags[0]} is for a picture alone: {self.state} has slices or costs")
-        settings = {"shader": state.shader, **state.settings()}
-        render, cost = partial(scene.render, **settings), partial(scene.cost, **settings)
-        saved_scene = replace(scene, shader=state.shader, render=render, cost=cost)
-        development = DevelopmentFlags(**vars(state.develop))
-        command = replace(self, show=state.show, development=development)
         width, height = parse_size(self.size)
         if state.slices is not None:
             _, _, width, height = panes(width, height)["view"]
         if state.camera is None:
-            camera = parse_camera(None, self.scene.look, width, height, saved_scene.info.space)
-        else:
-            camera = state.camera.camera(width, height, saved_scene.box)
-        return command._write_picture(saved_scene, camera, state, bar)
+            return parse_camera(self.camera, self.scene.look, width, height, scene.info.space)
+        return state.camera.camera(width, height, scene.box)
 
-    def _write_picture(
-        self, scene: RenderedScene, camera: Camera, state: ViewState | None, bar: Bar
-    ) -> RenderStats:
-        """Renders and writes the files, strip by strip where the file format allows it; a saved
-        state may add slices beside the picture and costs over it.
+    def _write_picture(self, scene: RenderedScene, state: ViewState, bar: Bar) -> RenderStats:
+        """Renders and writes what the state shows, strip by strip where the file format allows
+        it; a saved state may add slices beside the picture and costs over it.
         """
         from ..pictures import render_tiles
-        from ..viewer.state import blended
 
-        composed = state is not None and state.composed
-        needs_whole = self.npz is not None or self.show != "picture" or composed
+        if state.composed and (flags := given_flags(self.annotation)):
+            raise ValueError(f"{flags[0]} is for a picture alone: {self.state} has slices or costs")
+        camera, is_plain = self._camera(scene, state), state.show == "picture" and not state.slices
+        needs_whole = self.npz is not None or not is_plain
         strips = not needs_whole and in_strips(self.output.suffix, camera.width, camera.height)
         render = scene.render if strips else partial(scene.render, progress=bar)
-        render = self.development.wrap(render)
         anything_seen = False
 
-        def noting_render(camera: Camera) -> Picture:
+        def take(camera: Camera) -> Picture:
             nonlocal anything_seen
-            picture = render(camera)
+            picture = state.taken(render, camera)
             anything_seen = anything_seen or bool(picture.alpha.any())
             return picture
 
-        overlay = self._overlay(scene, camera, None if state is None else state.camera)
+        overlay = self._overlay(scene, state, camera)
         if strips:
             stats = render_tiles(
-                *(noting_render, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
+                *(take, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
             )
         else:
-            picture = canvas = noting_render(camera)
-            if self.show != "picture":
-                cost = scene.cost(camera).picture(self.show)
-                canvas = blended(picture, cost, 1 if state is None else state.blend)
-            if state is not None and state.slices is not None:
+            picture = take(camera)
+            canvas = scene.picture(state, camera, picture)
+            if state.slices is not None:
                 from ..viewer.slices import Planes
 
                 planes = Planes(scene.data, lambda problem: None)
@@ -232,20 +198,20 @@ class Render:
             if self.npz is not None:
                 picture.save(self.npz)
             stats = picture.stats
-        if not (anything_seen or composed or self.show != "picture"):
+        if is_plain and not anything_seen:
             limits = getattr(scene.data, "value_range", None)
             if isinstance(limits, list):  # a store has one for each channel
-                limits = limits[self.scene.look.component]
+                limits = limits[state.component]
             note = "" if limits is None else f": values range from {limits[0]:g} to {limits[1]:g}"
             warnings.warn(f"nothing is seen{note}", stacklevel=2)
         return stats
 
-    def _overlay(self, scene: RenderedScene, camera: Camera, eye: Eye | None) -> Overlay | None:
+    def _overlay(self, scene: RenderedScene, state: ViewState, camera: Camera) -> Overlay | None:
         from ..viewer.state import Eye
 
-        world_camera, component = camera.placed(scene.box), self.scene.look.component
-        eye = Eye.of(camera, scene.box) if eye is None else eye
-        return self.annotation.overlay(scene.shader, scene.info, component, world_camera, eye)
+        eye = Eye.of(camera, scene.box) if state.camera is None else state.camera
+        placed = camera.placed(scene.box)
+        return self.annotation.overlay(state.shader, scene.info, state.component, placed, eye)
 
 
 def in_strips(suffix: str, width: int, height: int) -> bool:

@@ -53,11 +53,13 @@ class RenderedScene:
         checked = RenderOptions(**options)
         return ViewState(shader=self.shader, options=checked, component=checked.component)
 
-    def picture(self, state: ViewState, camera: Camera) -> Picture:
-        """Returns the picture of a state, or the cost that it shows, from the given camera."""
-        if state.show == "picture":
-            return state.taken(self.render, camera)
-        return self.cost(camera, shader=state.shader, **state.settings()).picture(state.show)
+    def picture(self, state: ViewState, camera: Camera, picture: Picture | None = None) -> Picture:
+        """Returns what a state shows from the given camera, without planes beside it: the picture
+        (`picture`, if it is already rendered), or costs in its place or blended over it.
+        """
+        # The picture is rendered first: costs of a store are those of the data that it loaded.
+        developed = state.taken(self.render, camera) if picture is None else picture
+        return state.with_costs(lambda: developed, lambda: state.cost_picture(self.cost, camera))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -57,9 +57,12 @@ class View:
     def run(self) -> None:
         from ..viewer import view
         from ..viewer.server import aiohttp_web
+        from ..viewer.state import saved_state
 
         aiohttp_web()
-        self._check_state()
+        if self.state is not None:
+            state = saved_state(self.state)
+            self.scene.look.check_state("--state", state, camera=self.camera)
         scene, shader, camera, options = self._open_path()
         view(
             *(scene, shader, camera),
@@ -71,18 +74,6 @@ class View:
             wait=True,
             **options,
         )
-
-    def _check_state(self) -> None:
-        """Raises ValueError if a flag sets what a saved state sets."""
-        if self.state is None:
-            return
-        from ..viewer.state import saved_state
-
-        state = saved_state(self.state)
-        flags = self.scene.look.flags_set_by(state)
-        flags += ["--camera"] * (self.camera is not None and "camera" in state)
-        if flags:
-            raise ValueError(f"--state sets what {flags[0]} sets: leave one out")
 
     def _open_path(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         """Returns the scene, its shader, its camera, and fields of `RenderOptions`."""

@@ -58,7 +58,7 @@ class Clip:
 
     @cached_property
     def _checked_faces(self) -> Faces:
-        """The faces in the units of `frame`."""
+        """The clip's faces, checked and in the units of `frame`."""
         for name in Faces._fields:
             if not isinstance(getattr(self, name), (Sequence, Tensor)):
                 kind = type(getattr(self, name)).__name__

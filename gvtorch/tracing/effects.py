@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..base.records import Hits, Rays
 from ..ops.shading import pack
-from ..shaders.shader import CutSurface, Shader
+from ..shaders.shader import CutSurface, Shader, row_and_fraction
 from .clip import Clipped
 from .composite import TraceRays, box_span, tree_span
 from .lighting import Lighted
@@ -223,8 +223,7 @@ def _table_color(tracer: Tracer, value: Tensor) -> Tensor:
     """Returns (r, 3) the transfer function's colours of values (r, 1), read from its table."""
     table = tracer.arguments.table_lm4[0, :, :3]  # (m, 3), evenly spaced
     low, high = tracer.arguments.domain_2.unbind(0)
-    last = len(table) - 1
-    position = ((value - low) / (high - low) * last).clamp(0, last)
-    row = position.to(torch.int64).clamp(max=last - 1)
+    position = (value - low) / (high - low) * (len(table) - 1)
+    row, fraction = row_and_fraction(position, len(table))
     a, b = (table[(row + k)[:, 0]] for k in (0, 1))
-    return a + (position - row) * (b - a)
+    return a + fraction * (b - a)

@@ -55,6 +55,8 @@ def render(
 ) -> Picture:
     """Renders a resident tree, or several.
 
+    Several threads may render one tree; `stats` then count the use by all of them.
+
     Args:
         tree: The tree, on the device that renders it; its stamps and request words are written. Or
             trees by name, on one device: where they overlap, they are composited by sample. A
@@ -66,8 +68,6 @@ def render(
             name.
         progress: Receives the number of finished rows.
         **options: Fields of `RenderOptions`.
-
-    Several threads may render one tree; `stats` then count the use by all of them.
 
     Returns:
         The picture, (h, w, c) for one camera and (n, h, w, c) for a batch.

@@ -16,7 +16,7 @@ from ..pictures import Picture, Progressive
 from .protocol import binary_message, message_text
 from .scene import Scene
 from .slices import Planes, panes
-from .state import Eye, ViewState, blended
+from .state import Eye, ViewState
 
 Send = Callable[[str | bytes], None]  # from any thread; does not block
 
@@ -214,10 +214,10 @@ class Client:
         camera, start = self.eye.camera(width, height, scene.box), time.perf_counter()
         if state.show != "picture":
             camera = self.eye.camera(max(1, width // 2), max(1, height // 2), scene.box)
-            picture = scene.cost(camera, state, stop_if_outdated)
-            if state.blend < 1:
-                below = state.develop.develop(scene.frame(camera, state, stop_if_outdated))
-                picture = blended(below, picture, state.blend)
+            picture = state.with_costs(
+                lambda: state.develop.develop(scene.frame(camera, state, stop_if_outdated)),
+                lambda: scene.cost(camera, state, stop_if_outdated),
+            )
             self._finished = True
             self._show_picture(
                 picture, camera, state, _FINAL_QUALITY, 1e3 * (time.perf_counter() - start)

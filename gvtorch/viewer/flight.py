@@ -157,17 +157,11 @@ class Flight:
         share = check.number("Flight", "share", share, low=0, high=1)
         return self.at(self._times[-1] if share == 1 else self._times[0] + share * self.seconds)
 
-    def states(self, fps: float = 25, frames: int | None = None) -> Iterator[ViewState]:
-        """Yields the state of each picture of a film, from the first key to the last; of a closed
-        flight without the last, which is the first of the next round.
-
-        Args:
-            fps: Pictures a second.
-            frames: Number of pictures, evenly spaced, instead of `fps`.
+    def states(self, fps: float = 25) -> Iterator[ViewState]:
+        """Yields the state of each picture of a film with `fps` pictures a second, from the first
+        key to the last; of a closed flight without the last, which is the first of the next round.
         """
-        count = (
-            self.count(fps) if frames is None else check.integer("Flight", "frames", frames, low=1)
-        )
+        count = self.count(fps)
         steps = max(1, count if self.closed else count - 1)
         for n in range(count):
             yield self.along(n / steps)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from os import PathLike, fspath
 from typing import Any
 
@@ -33,7 +34,7 @@ from ..shaders.labels import label_rows
 from ..shaders.presets import IN_HU
 from ..tracing import cost, render
 from .schema import MAX_ITEMS
-from .state import ViewState, costed
+from .state import ViewState
 
 BINS = 256  # of a histogram, at most
 _MAX_BOXES = 1500  # most boxes of nodes that are sent to a page
@@ -102,10 +103,7 @@ class Scene:
     def cost(self, camera: Camera, state: ViewState, progress: Progress) -> Picture:
         """Renders what a frame costs with the data loaded now, in false colours."""
         (tree,) = self.trees[:1]
-        assert state.show != "picture"
-        unlit = {**state.settings(), "lighting": None}
-        costs = cost(tree, camera, costed(state.shader), progress=progress, **unlit)
-        return costs.picture(state.show)
+        return state.cost_picture(partial(cost, tree, progress=progress), camera)
 
     def voxels(self, purpose: str) -> Volume | Store:
         """Returns the voxels of which planes and surfaces are made.

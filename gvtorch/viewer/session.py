@@ -13,12 +13,9 @@ from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
-import torch
-
 from ..base.messages import one_line
 from ..base.volume import Volume
-from ..cameras import Camera
-from ..cameras.poses import Up, upward
+from ..cameras.models import MODELS
 from ..engine import EngineOptions
 from ..io.stores.store import Store
 from ..pictures import Picture
@@ -289,6 +286,10 @@ class Session:
             },
             **self._state_content(),
             schema=schema(),
+            models={
+                name: {"parallel": model.parallel, "planar": model.planar}
+                for name, model in MODELS.items()
+            },
             presets=[*PRESETS, *CT_PRESETS, *_COLOR_MAPS],
             engine=None
             if engine is None or self.scene.remake is None
@@ -512,7 +513,7 @@ class Session:
                 self._planes.retry()
             self._restart_pictures()
         else:
-            eye = fitted(self.scene, client.eye, client.size)
+            eye = client.eye.fitted(self.scene.box, *client.size)
             self._move_camera(client, eye, False)
             client.send_message("camera", camera=encode(eye))
 
@@ -525,23 +526,6 @@ class Session:
             *(self.scene, lambda: self._planes, self.state, eye, size),
             unwanted=lambda: self._closed or has_left(),
         )
-
-
-def fitted(scene: Scene, like: Eye | None, size: tuple[int, int], up: Up | None = None) -> Eye:
-    """Returns an eye that sees the whole box, from the side of `like` or the default one."""
-    box = scene.box
-    width, height = (max(1, n) for n in size)
-    if like is None:
-        camera = Camera.orbit(30, 20, width=width, height=height, up=up or "+y", fit=True)
-        eye = Eye.of(camera, box)
-        return replace(eye, up=tuple(upward("view", up or "+y").tolist()))
-    forward = torch.tensor(like.target) - torch.tensor(like.eye)
-    centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
-    half_angle = torch.deg2rad(torch.tensor(min(like.fov, 100.0))) / 2
-    aspect = min(1.0, width / height)
-    distance = radius / max(1e-3, float(half_angle.sin())) / aspect
-    position = centre - forward.double() / forward.norm() * distance
-    return replace(like, eye=tuple(position.tolist()), target=tuple(centre.tolist()))
 
 
 def schema() -> dict[str, Any]:

@@ -173,7 +173,9 @@ class Planes:
         return int(np.clip(np.floor(np.log2(pixel_size / voxel_size)), 0, self.data.levels - 1))
 
     def _plane_layout(self, axis: str, pane: Pane, pixel_size: float) -> dict[str, Any]:
-        """Returns the layout of a plane: its part, its picture there, its edges in the world."""
+        """Returns the layout of a plane: which part of the picture it takes, where its image lies
+        in that part, and its edges in world coordinates.
+        """
         low, high = (dict(zip("xyz", corner.tolist(), strict=True)) for corner in self._corners())
         column, row = self._sides(axis)
         view = self.views[axis]

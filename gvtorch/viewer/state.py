@@ -20,12 +20,13 @@ from ..base.messages import one_line
 from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
+from ..cameras.poses import Up, upward
 from ..engine import Engine
 from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
 from ..pool import N3Tree
 from ..shaders import Shader, TransferFunction
-from ..tracing import RenderOptions, render
+from ..tracing import Cost, RenderOptions, render
 from .schema import decode, encode
 
 Triple = tuple[float, float, float]
@@ -96,8 +97,8 @@ class Eye:
             distance = half_height / math.tan(math.radians(fov / 2))
             eye = eye + forward * (float((box.mean(0) - eye) @ forward) - distance)
         else:
-            is_angular = model in ("fisheye", "panorama")
-            fov = math.degrees(2 * half_height if is_angular else 2 * math.atan(half_height))
+            is_planar = MODELS[model].planar
+            fov = math.degrees(2 * math.atan(half_height) if is_planar else 2 * half_height)
         target = eye + distance * forward
         triples = (tuple(vector.tolist()) for vector in (eye, target, -rotation[1]))
         return cls(
@@ -105,6 +106,22 @@ class Eye:
             fov=round(fov, 9),
             model=model,
         )
+
+    @classmethod
+    def first(cls, box: Tensor, width: int, height: int, up: Up = "+y") -> Self:
+        """Returns the default eye: it sees the whole (2, 3) box, in a picture of such a shape."""
+        camera = Camera.orbit(30, 20, width=width, height=height, up=up, fit=True)
+        return replace(cls.of(camera, box), up=tuple(upward("view", up).tolist()))
+
+    def fitted(self, box: Tensor, width: int, height: int) -> Self:
+        """Returns the eye that looks the same way and sees the whole (2, 3) box."""
+        forward = torch.tensor(self.target) - torch.tensor(self.eye)
+        centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
+        half_angle = torch.deg2rad(torch.tensor(min(self.fov, 100.0))) / 2
+        aspect = min(1.0, max(1, width) / max(1, height))
+        distance = radius / max(1e-3, float(half_angle.sin())) / aspect
+        position = centre - forward.double() / forward.norm() * distance
+        return replace(self, eye=tuple(position.tolist()), target=tuple(centre.tolist()))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +139,7 @@ class Development:
     exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        check.integer("Development", "samples", self.samples, low=1, high=4096)
+        check.integer("Development", "samples", self.samples, low=1, high=65536)
         checked_curve("Development", self.tone, self.exposure)
 
     def develop(self, picture: Picture) -> Picture:
@@ -130,6 +147,12 @@ class Development:
         if self.tone == "none" and self.exposure == 0:
             return picture
         return picture.tone_map(self.tone, exposure=self.exposure)
+
+    def take(self, render: Callable[[Camera], Picture], camera: Camera) -> Picture:
+        """Renders the picture of a camera at rest: the mean of all samples, developed."""
+        if self.samples == 1:
+            return self.develop(render(camera))
+        return self.develop(Progressive(render).refine(camera, self.samples))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,10 +244,36 @@ class ViewState:
         renderer = what.render if isinstance(what, Engine) else partial(render, what)
         return self.taken(renderer, self.camera.camera(width, height, what.box))
 
-    def taken(self, drawn: Callable[..., Picture], camera: Camera) -> Picture:
-        """Renders the picture at rest; `drawn` takes the camera, and by name shader and options."""
-        renderer = partial(drawn, shader=self.shader, **self.settings())
-        return self.develop.develop(Progressive(renderer).refine(camera, self.develop.samples))
+    def taken(self, render: Callable[..., Picture], camera: Camera) -> Picture:
+        """Renders the picture at rest; `render` takes the camera, and by name shader and options.
+        It is without costs and planes, see `with_costs` and `Planes.composed`.
+        """
+        renderer = partial(render, shader=self.shader, **self.settings())
+        return self.develop.take(renderer, camera)
+
+    def cost_picture(self, cost: Callable[..., Cost], camera: Camera) -> Picture:
+        """Renders the costs that `show` names, in false colours; `cost` takes the camera, and by
+        name shader and options. The shader's transfer function stands for the shader, unlit.
+
+        Raises:
+            ValueError: The shader has no transfer function.
+        """
+        assert self.show != "picture"
+        settings = {**self.settings(), "lighting": None}
+        return cost(camera, shader=costed(self.shader), **settings).picture(self.show)
+
+    def with_costs(self, picture: Callable[[], Picture], costs: Callable[[], Picture]) -> Picture:
+        """Returns the developed picture, or costs in its place or blended over it, as the state
+        says. Calls only what it needs.
+        """
+        if self.show == "picture":
+            return picture()
+        top = costs()
+        if self.blend == 1:
+            return top
+        below = picture()
+        weight = self.blend * top.alpha.to(below.color)
+        return replace(top, color=torch.lerp(below.color, top.color.to(below.color), weight))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the state as plain values, ready for JSON."""
@@ -284,11 +333,3 @@ def saved_state(path: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("options", {}), dict):
         raise ValueError(f"{path}: not a state: it must be an object with the state's fields")
     return content
-
-
-def blended(picture: Picture, cost: Picture, fraction: float) -> Picture:
-    """Returns a cost picture, blended by `fraction` over the picture (1: alone); both developed."""
-    if fraction == 1:
-        return cost
-    weight = fraction * cost.alpha.to(picture.color)
-    return replace(cost, color=torch.lerp(picture.color, cost.color.to(picture.color), weight))

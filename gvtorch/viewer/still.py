@@ -12,7 +12,7 @@ from ..pictures import Picture, Progressive
 from .client import Client, Interrupted, image_file
 from .scene import Scene
 from .slices import Planes, panes
-from .state import Eye, ViewState, blended
+from .state import Eye, ViewState
 
 Steps = Generator[None, None, Picture]
 
@@ -49,9 +49,8 @@ def still_steps(
     while progressive.count < state.develop.samples:
         yield
         picture = progressive.frame(camera)
-    shown = state.develop.develop(picture)
-    if state.show != "picture":
-        shown = blended(shown, scene.cost(camera, state, stop_if_unwanted), state.blend)
+    developed = state.develop.develop(picture)
+    shown = state.with_costs(lambda: developed, lambda: scene.cost(camera, state, stop_if_unwanted))
     beside = planes()
     if beside is None or state.slices is None:
         return shown

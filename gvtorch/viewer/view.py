@@ -22,7 +22,7 @@ from ..tracing.options import RenderSettings, render_options
 from .parameters import Parameters
 from .scene import Scene, open_scene
 from .server import Server, aiohttp_web
-from .session import Session, fitted
+from .session import Session
 from .state import Eye, ViewState
 
 _ASPECT = (16, 9)  # shape of the picture to which the first camera fits the box
@@ -172,7 +172,7 @@ def new_session(
             chosen = chosen.read(Path(state))
         if chosen.camera is None:
             if camera is None:
-                eye = fitted(scene, None, _ASPECT, up)
+                eye = Eye.first(scene.box, *_ASPECT, up or "+y")
             else:
                 eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)

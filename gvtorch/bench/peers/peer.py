@@ -72,7 +72,8 @@ def spans(task: Task) -> Tensor:
 
 def bake(shader: TransferFunction, step: float, rows: int) -> np.ndarray:
     """Samples a transfer function over [0, 255]. Returns (rows, 4) float64: colour, not
-    premultiplied, and opacity of one step (world units); 255 k + 1 rows hit all multiples of 1 / k.
+    premultiplied, and opacity of one step (world units); with 255 k + 1 rows, every multiple of
+    1 / k is a row.
     """
     table = shader(np.linspace(0, 255, rows))
     with np.errstate(divide="ignore"):

@@ -12,7 +12,7 @@ import ctypes
 import numpy as np
 import torch
 import vtkmodules.vtkRenderingOpenGL2
-import vtkmodules.vtkRenderingVolumeOpenGL2  # noqa: F401  (registers what draws)
+import vtkmodules.vtkRenderingVolumeOpenGL2  # noqa: F401  (registers the classes that render)
 from torch import Tensor
 from vtkmodules.util.numpy_support import numpy_to_vtk
 from vtkmodules.vtkCommonCore import vtkObject

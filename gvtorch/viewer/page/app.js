@@ -1,5 +1,5 @@
 // The page: its copy of the view's state, its parts, and the messages that it handles and sends.
-import { between, distance, facing } from "./camera.js";
+import { between, distance, facing, MODELS } from "./camera.js";
 import { el, iconButton, saveFile, openJson } from "./dom.js";
 import { ClipEditor } from "./clip.js";
 import { Film } from "./film.js";
@@ -112,6 +112,7 @@ export class App {
       number: message.client, box: message.box, unit: message.unit, schema: message.schema, time: message.time, labels: message.labels,
       channels: message.channels, widths: message.widths, engine: message.engine, parameters: message.parameters,
     });
+    Object.assign(MODELS, message.models);
     this.presets.builtIn = message.presets;
     this.root.classList.remove("gv-lost");
     this.note.classList.remove("gv-shown");

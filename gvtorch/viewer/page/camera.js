@@ -1,6 +1,9 @@
 // A camera as in the state, {eye, target, up, fov, model}, and how it moves; no DOM here.
 import { add, clamp, cross, dot, length, sub, times, turned, unit } from "./vectors.js";
 
+/** The camera models by name, as the server describes them: {parallel, planar}. */
+export const MODELS = {};
+
 export const distance = (c) => length(sub(c.target, c.eye));
 
 /** Unit vectors to the right, up and forward of the picture. */
@@ -14,6 +17,9 @@ export function axes(c) {
 
 /** Half the picture's height in world units, at the target's distance. */
 export const halfHeight = (c) => distance(c) * Math.tan(((Math.min(c.fov, 170) / 2) * Math.PI) / 180);
+
+/** The same at a depth along the axis. */
+export const halfHeightAt = (c, depth) => (MODELS[c.model].parallel ? halfHeight(c) : (depth * halfHeight(c)) / distance(c));
 
 /** Orbits the target by angles (radians) to the right and up. */
 export function orbited(c, yaw, pitch) {
@@ -69,8 +75,8 @@ export function facing(c, axis, side, up) {
 export function projected(c, position) {
   const { right, up, forward } = axes(c), offset = sub(position, c.eye);
   const depth = dot(offset, forward);
-  const half = c.model === "ortho" ? halfHeight(c) : (depth * halfHeight(c)) / distance(c);
-  if (c.model !== "ortho" && depth <= 1e-9 * distance(c)) return null;
+  const half = halfHeightAt(c, depth);
+  if (!MODELS[c.model].parallel && depth <= 1e-9 * distance(c)) return null;
   return { x: dot(offset, right) / half, y: -dot(offset, up) / half, depth };
 }
 

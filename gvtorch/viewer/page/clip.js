@@ -1,5 +1,5 @@
 // The clip: its boxes and planes in the world, and their handles in the picture.
-import { axes, halfHeight, distance, projected } from "./camera.js";
+import { axes, halfHeightAt, projected } from "./camera.js";
 import { COLORS, corner, EDGES, largestSide } from "./picture.js";
 import { add, clamp, cross, dot, sub, times, unit } from "./vectors.js";
 
@@ -166,8 +166,7 @@ export class ClipEditor {
     const tip = add(anchor, times(normal, -ARROW * this.side));
     const { right, up } = axes(camera), depth = projected(camera, tip)?.depth;
     if (!depth) return;
-    const halfWorld = camera.model === "ortho" ? halfHeight(camera) : (depth * halfHeight(camera)) / distance(camera);
-    const pixelSize = halfWorld / (this.view.pictureRect[3] / 2);
+    const pixelSize = halfHeightAt(camera, depth) / (this.view.pictureRect[3] / 2);
     const moved = add(tip, add(times(right, dx * pixelSize), times(up, -dy * pixelSize)));
     const turned = unit(sub(anchor, moved));
     this.putPlane(n, turned, -dot(turned, anchor));

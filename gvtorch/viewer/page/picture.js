@@ -1,5 +1,5 @@
 // The canvas: pictures as they come, and over them axes, scale bar, boxes and handles.
-import { axes, halfHeight, projected } from "./camera.js";
+import { axes, halfHeight, MODELS, projected } from "./camera.js";
 import { el } from "./dom.js";
 import { short } from "./vectors.js";
 
@@ -104,7 +104,7 @@ export class PictureView {
     if (!camera || !app.box) return;
     context.lineCap = "round";
     app.slices.draw(context);
-    if (camera.model === "fisheye" || camera.model === "panorama") return;
+    if (!MODELS[camera.model].planar) return;
     context.save();
     context.beginPath();
     context.rect(...this.pictureRect);

@@ -1,5 +1,5 @@
-"""`Mail`: rows of answers on their way from the host to a recorded frame. Any thread may post rows,
-into pinned memory; a frame sends all posted rows in one copy, for which the host does not wait.
+"""`UploadQueue`: rows of answers on their way from the host to a recorded frame. Any thread may add
+rows, into pinned memory; a frame sends all added rows in one copy, and the host does not wait.
 """
 
 from __future__ import annotations
@@ -19,50 +19,50 @@ _BUFFERS = 3  # one is filled while the others may still be copied
 _ALIGN = 16  # bytes: alignment of fields
 
 
-class Mail:
-    """Boxes with room for `rows` rows each. A row's field `node` is -1 where the row is empty.
+class UploadQueue:
+    """Tables with room for `rows` rows each. A row's field `node` is -1 where the row is empty.
 
     Attributes:
-        device_boxes: For each box, its fields (rows, ...) on the device.
+        device_tables: For each table, its fields (rows, ...) on the device.
         sent: Number of rows sent since `HostFrame.release` last reset it.
     """
 
-    def __init__(self, boxes: Mapping[str, RowForm], rows: int, device: torch.device) -> None:
+    def __init__(self, tables: Mapping[str, RowForm], rows: int, device: torch.device) -> None:
         """Allocates the buffers."""
         self.rows, self.sent = rows, 0
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, Mapping[str, Tensor], int]] = deque()
-        self._filled_rows = dict.fromkeys(boxes, 0)
-        self._node_rows = rows * len(boxes)  # node fields, at the front of a buffer
+        self._filled_rows = dict.fromkeys(tables, 0)
+        self._node_rows = rows * len(tables)  # node fields, at the front of a buffer
         fields: dict[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]] = {}
         size = 8 * self._node_rows
-        for box_index, (box, form) in enumerate(boxes.items()):
-            fields[box, "node"] = (8 * rows * box_index, (rows,), torch.int64)
+        for table_index, (table, form) in enumerate(tables.items()):
+            fields[table, "node"] = (8 * rows * table_index, (rows,), torch.int64)
             for name, (shape, dtype) in form.items():
                 size = -(-size // _ALIGN) * _ALIGN
-                fields[box, name] = (size, (rows, *shape), dtype)
+                fields[table, name] = (size, (rows, *shape), dtype)
                 size += math.prod((rows, *shape)) * dtype.itemsize
         self._cuda = device.type == "cuda"
         self._device_buffer = torch.zeros(size, dtype=torch.uint8, device=device)
         self._host_buffers = [
             torch.zeros(size, dtype=torch.uint8, pin_memory=self._cuda) for _ in range(_BUFFERS)
         ]
-        self.device_boxes = _views(self._device_buffer, fields)
-        self._host_boxes = [_views(buffer, fields) for buffer in self._host_buffers]
+        self.device_tables = _views(self._device_buffer, fields)
+        self._host_tables = [_views(buffer, fields) for buffer in self._host_buffers]
         self._copy_events: list[Any] = [None] * _BUFFERS  # CUDA events
         self._open = 0  # index of the buffer that is being filled
         for buffer in (self._device_buffer, *self._host_buffers):
             self._clear_buffer(buffer)
 
-    def post(self, box: str, rows: Mapping[str, Tensor]) -> None:
-        """Queues rows (k, ...) for a box, in host memory; rows that find no room are sent later."""
+    def add(self, table: str, rows: Mapping[str, Tensor]) -> None:
+        """Queues rows (k, ...) for a table, in host memory; those without room are sent later."""
         if len(rows["node"]):
             with self._lock:
-                self._queue.append((box, rows, 0))
+                self._queue.append((table, rows, 0))
                 self._fill_open_buffer()
 
     def send(self) -> bool:
-        """Starts copying the posted rows to the device, unless all buffers are still being copied;
+        """Starts copying the added rows to the device, unless all buffers are still being copied;
         rows sent before must have been processed (`clear`). Returns whether anything was sent.
         """
         with self._lock:
@@ -80,7 +80,7 @@ class Mail:
             return True
 
     def clear(self) -> None:
-        """Empties all boxes on the device."""
+        """Empties all tables on the device."""
         self._clear_buffer(self._device_buffer)
 
     def forget(self) -> None:
@@ -96,31 +96,31 @@ class Mail:
     def _fill_open_buffer(self) -> None:
         """Moves rows from the queue to the open buffer, in their order."""
         while self._queue:
-            box, rows, first = self._queue.popleft()
-            row, total = self._filled_rows[box], len(rows["node"])
+            table, rows, first = self._queue.popleft()
+            row, total = self._filled_rows[table], len(rows["node"])
             count = min(self.rows - row, total - first)
             for name, values in rows.items():
-                self._host_boxes[self._open][box][name][row : row + count] = values[
+                self._host_tables[self._open][table][name][row : row + count] = values[
                     first : first + count
                 ]
-            self._filled_rows[box] += count
+            self._filled_rows[table] += count
             if first + count < total:
-                self._queue.appendleft((box, rows, first + count))
+                self._queue.appendleft((table, rows, first + count))
                 return
 
     def _clear_buffer(self, buffer: Tensor) -> None:
         buffer[: 8 * self._node_rows].view(torch.int64).fill_(-1)
 
     def __repr__(self) -> str:
-        return f"Mail({', '.join(self._filled_rows)}; {self.rows} rows each)"
+        return f"UploadQueue({', '.join(self._filled_rows)}; {self.rows} rows each)"
 
 
 def _views(
     buffer: Tensor, fields: Mapping[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]]
 ) -> dict[str, dict[str, Tensor]]:
-    """Returns views of the fields of each box in a buffer."""
-    boxes: dict[str, dict[str, Tensor]] = {}
-    for (box, name), (offset, shape, dtype) in fields.items():
+    """Returns views of the fields of each table in a buffer."""
+    tables: dict[str, dict[str, Tensor]] = {}
+    for (table, name), (offset, shape, dtype) in fields.items():
         field_bytes = buffer[offset : offset + math.prod(shape) * dtype.itemsize]
-        boxes.setdefault(box, {})[name] = field_bytes.view(dtype).view(shape)
-    return boxes
+        tables.setdefault(table, {})[name] = field_bytes.view(dtype).view(shape)
+    return tables
