@@ -32,7 +32,15 @@ from ..producers import Bricks, Region, Regions
 from .mail import Mail, RowForm
 from .production import Production
 from .recorded import RecordedFrame, SlotCounts
-from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
+from .request_batch import (
+    ProducedTree,
+    RequestBatch,
+    brick_words,
+    children_of,
+    give_up,
+    halves_to_retry,
+    valid_part,
+)
 from .stats import Collected, FrameStats
 
 _CALL_GAP = 0.02  # seconds after which a late answer no longer delays the next call
@@ -57,10 +65,11 @@ class HostFrame(RecordedFrame):
         # Nodes asked for, and failed, since the last `release`.
         self._asked_count = self._failed_count = 0
         self.active = False  # whether frames have been rendered since the last `release`
-        self._lock = threading.Lock()  # held to read or write the four fields below
+        self._lock = threading.Lock()  # held to read or write the five fields below
         self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # deadlines
         self._chosen: dict[int, list[Tensor]] = {kind: [] for kind in KINDS.values()}
         self._last_call = dict.fromkeys(KINDS.values(), -math.inf)  # seconds
+        self._raise_count = 0  # calls that raised since nodes were last taken from `_chosen`
         self._ask_scheduled = False  # whether `_ask_producers` is scheduled
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="gvtorch-ask")
 
@@ -201,6 +210,7 @@ class HostFrame(RecordedFrame):
         """Asks for chosen nodes; of a kind with an answer due, `_CALL_GAP` after its last call."""
         with self._lock:
             self._ask_scheduled, generation, now = False, self.generation, time.monotonic()
+            self._raise_count = 0
             busy_kinds = {batch.kind for _, batch in self._waiting.values()}
             free_kinds = [
                 kind
@@ -251,14 +261,12 @@ class HostFrame(RecordedFrame):
             for future in overdue:
                 del self._waiting[future]
         for future, batch in overdue.items():
-            future.cancel()
-            self._fail(batch, f"no answer within {batch.source.patience:g} s")
+            give_up(batch, future, self._fail)
 
     def _ask_halves(self, batch: RequestBatch, error: Exception) -> None:
-        if len(batch) == 1:
-            self._fail(batch, f"{type(error).__name__}: {error}", error)
-            return
-        for half in batch.halves():
+        with self._lock:
+            self._raise_count += 1
+        for half in halves_to_retry(batch, error, self._raise_count, self._fail):
             self._submit(half)
 
     def _settle(self, batch: RequestBatch, get_answer: Callable[[], Any]) -> None:
@@ -270,18 +278,14 @@ class HostFrame(RecordedFrame):
         except Exception as error:
             self._ask_halves(batch, error)
             return
-        try:
-            checked = batch.check(answer)
-            reasons, kept = batch.node_errors(checked)
-            for index, message in reasons.items():
-                self._fail(batch[index : index + 1], message)
-            kept_index = kept.nonzero()[:, 0]
-            if isinstance(checked, Regions):
-                self._post_tiles(batch, checked, kept_index)
-            else:
-                self._post_bricks(batch, checked, kept_index)
-        except ValueError as error:
-            self._fail(batch, str(error), error)
+        valid = valid_part(batch, answer, self._fail)
+        if valid is None:
+            return
+        valid_batch, checked = valid
+        if isinstance(checked, Regions):
+            self._post_tiles(valid_batch, checked)
+        else:
+            self._post_bricks(valid_batch, checked)
 
     def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
         """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
@@ -290,9 +294,9 @@ class HostFrame(RecordedFrame):
                 self._failed_count += len(batch)
                 self._production.failures.add(batch, message, cause)
 
-    def _post_tiles(self, batch: RequestBatch, answer: Regions, kept_index: Tensor) -> None:
+    def _post_tiles(self, batch: RequestBatch, answer: Regions) -> None:
         if answer.alias is not None:
-            self._leave_to_host(batch[kept_index])
+            self._leave_to_host(batch)
             return
         children, targets = children_of(batch, answer, self.cache), batch.targets
         rows = {
@@ -302,9 +306,9 @@ class HostFrame(RecordedFrame):
             "brick": children.brick,
         }
         fields = {"constants": children.constants, "ranges": children.ranges}
-        self._post(batch, "tiles", rows, fields, kept_index)
+        self._post(batch, "tiles", rows, fields)
 
-    def _post_bricks(self, batch: RequestBatch, answer: Bricks, kept_index: Tensor) -> None:
+    def _post_bricks(self, batch: RequestBatch, answer: Bricks) -> None:
         fields: dict[str, Mapping[str, Any]]
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
@@ -314,26 +318,26 @@ class HostFrame(RecordedFrame):
         }
         fields = {"data": data}
         if kind is None:
-            self._post(batch, "bricks", rows, fields, kept_index)
+            self._post(batch, "bricks", rows, fields)
             return
-        is_alias = kind[kept_index] == Region.ALIAS
+        is_alias = kind == Region.ALIAS
         if bool(is_alias.any()):
-            self._leave_to_host(batch[kept_index[is_alias]])
+            self._leave_to_host(batch[is_alias])
         brick_word = brick_words(kind)
-        is_uniform = brick_word[kept_index] != ABSENT
-        self._post(batch, "bricks", rows, fields, kept_index[~is_uniform & ~is_alias])
+        is_uniform = brick_word != ABSENT
+        self._post(batch, "bricks", rows, fields, ~is_uniform & ~is_alias)
         zeros = {
             name: torch.zeros((len(kind), channel.width), dtype=channel.dtype)
             for name, channel in batch.source.producer.channels.items()
         }
         fields = {"constants": {**zeros, **answer.constants}}
-        self._post(batch, "uniform", {**rows, "word": brick_word}, fields, kept_index[is_uniform])
+        self._post(batch, "uniform", {**rows, "word": brick_word}, fields, is_uniform)
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
-        self._post(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+        self._post(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {})
 
     def _post(
         self,
@@ -341,10 +345,11 @@ class HostFrame(RecordedFrame):
         box: str,
         rows: Mapping[str, Tensor],
         fields: Mapping[str, Mapping[str, Tensor]],
-        index: Tensor | slice,
+        index: Tensor | None = None,
     ) -> None:
-        """Posts entries `index` of `rows`, and of `fields` by channel. A node may be posted only
-        once; those of an earlier generation are dropped: they may have been requested again.
+        """Posts copies of the entries `index`, or all, of `rows`, and of `fields` by channel. A
+        node may be posted only once; those of an earlier generation are dropped: they may have been
+        requested again.
         """
         flat_fields = {
             f"{name}.{channel}": values
@@ -353,7 +358,7 @@ class HostFrame(RecordedFrame):
         }
         mail = self._mail[self._mail_index[batch.source.tree.number]]
         posted = {
-            name: movable(values)[index].view(values.dtype)
+            name: values.clone() if index is None else movable(values)[index].view(values.dtype)
             for name, values in {**rows, **flat_fields}.items()
         }
         with self._lock:

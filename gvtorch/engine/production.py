@@ -33,11 +33,13 @@ from .request_batch import (
     by_kind,
     check_and_ship,
     children_of,
+    give_up,
+    halves_to_retry,
     ship_voxels,
+    valid_part,
 )
 from .stats import Counts, FrameStats
 
-_MAX_RAISING_CALLS = 256  # calls in one frame that may raise before whole batches are given up
 _MAX_WAIT_SECONDS = 1e6  # seconds
 _MAX_NAMED_FAILURES = 1000  # most failures kept by name; all are counted
 
@@ -120,13 +122,12 @@ class _PendingBatch:
     batch: RequestBatch
     producer_future: Future  # what the producer returned
     answer_future: Future  # of the same answer, after bricks on the host were checked and sent
-    patience: float  # seconds
     asked_at: float  # time.monotonic()
 
     @property
     def seconds_left(self) -> float:
         """Seconds until it is given up."""
-        return self.asked_at + self.patience - time.monotonic()
+        return self.asked_at + self.batch.source.patience - time.monotonic()
 
 
 def _try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
@@ -256,8 +257,7 @@ class Production:
                 self._waiting.remove(item)
             elif item.seconds_left < 0:
                 self._waiting.remove(item)
-                item.producer_future.cancel()
-                self._fail(item.batch, f"no answer within {item.patience:g} s")
+                give_up(item.batch, item.producer_future, self._fail)
         return answered
 
     def write(self, answers: Sequence[Answered], stats: FrameStats) -> None:
@@ -357,10 +357,8 @@ class Production:
         if isinstance(answer, Future):
             if not answer.done():
                 self._mark(batch)
-                future, patience = self._ship_on_arrival(batch, answer), batch.source.patience
-                self._waiting.append(
-                    _PendingBatch(batch, answer, future, patience, time.monotonic())
-                )
+                future = self._ship_on_arrival(batch, answer)
+                self._waiting.append(_PendingBatch(batch, answer, future, time.monotonic()))
                 return []
             answer, raised = _try_call(answer.result)
         answered = self._settle(batch, answer, raised)
@@ -387,24 +385,12 @@ class Production:
         """Checks an answer; if the producer raised, asks it again for each half of the batch."""
         if raised is not None:
             self._raise_count += 1
-            if len(batch) == 1 or self._raise_count > _MAX_RAISING_CALLS:
-                self._fail(batch, f"{type(raised).__name__}: {raised}", raised)
-                return []
-            return [answered for half in batch.halves() for answered in self._submit(half)]
+            halves = halves_to_retry(batch, raised, self._raise_count, self._fail)
+            return [answered for half in halves for answered in self._submit(half)]
         if isinstance(answer, Shipment):
             return [Answered(batch, answer)]
-        try:
-            checked = batch.check(answer)
-        except ValueError as error:
-            self._fail(batch, str(error), error)
-            return []
-        if checked.errors:
-            reasons, kept = batch.node_errors(checked)
-            for index, message in reasons.items():
-                self._fail(batch[index : index + 1], message)
-            rows = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
-            batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(rows)
-        return [Answered(batch, ship_voxels(batch, checked, self.staging))] if len(batch) else []
+        valid = valid_part(batch, answer, self._fail)
+        return [] if valid is None else [Answered(valid[0], ship_voxels(*valid, self.staging))]
 
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
@@ -459,7 +445,7 @@ class Production:
         lacking = batch.targets.lacking(self.cache, batch.kind)
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 
-    def _fail(self, batch: RequestBatch, message: str, cause: Exception | None = None) -> None:
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
         """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         self._mark(batch)
         self.failures.add(batch, message, cause)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -19,6 +20,8 @@ from ..pool import N3Tree, Staging, TableRows
 from ..pool.staging import Shipment, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
+
+_MAX_RAISING_CALLS = 256  # calls for a list of requests that may raise before batches are given up
 
 #: First and last `Region` of the kinds of answers that are written in the same way.
 _WRITTEN_ALIKE = (
@@ -87,11 +90,6 @@ class RequestBatch:
                 parts.append(replace(part, coarse=mask is coarse))
         return parts
 
-    def halves(self) -> tuple[RequestBatch, RequestBatch]:
-        """Returns the first half, and the rest: asked separately, a bad node fails alone."""
-        middle = len(self) // 2
-        return self[:middle], self[middle:]
-
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
         if isinstance(index, Tensor):
             index = upload(index, self.targets.node.device)
@@ -122,17 +120,6 @@ class RequestBatch:
         """How many items an answer has for each node of the batch."""
         return len(self.loc) // len(self)
 
-    def node_errors(self, answer: Regions | Bricks) -> tuple[dict[int, str], Tensor]:
-        """Returns why nodes failed, by index in the batch: the first error among a node's items;
-        and (k,) bool, which nodes did not fail.
-        """
-        reasons: dict[int, str] = {}
-        for index in sorted(answer.errors):
-            reasons.setdefault(index // self.per_node, answer.errors[index])
-        kept = torch.ones(len(self), dtype=torch.bool)
-        kept[list(reasons)] = False
-        return reasons, kept
-
     def alias_tree(self, answer: Regions | Bricks) -> int:
         """Number of the tree in which the alias targets of an answer lie."""
         name, layout = answer.alias_tree, self.source.layout
@@ -155,6 +142,53 @@ class Answered(NamedTuple):
 
     batch: RequestBatch
     answer: Regions | Bricks | Shipment
+
+
+#: Records a batch as failed: the batch, the message, and the error if the producer raised one.
+Fail = Callable[[RequestBatch, str, BaseException | None], None]
+
+
+def halves_to_retry(
+    batch: RequestBatch, error: BaseException, raise_count: int, fail: Fail
+) -> Sequence[RequestBatch]:
+    """Returns the halves of a batch for which the producer raised: asked separately, a bad node
+    fails alone. A single node fails, and so does the batch after too many calls that raised.
+    """
+    if len(batch) == 1 or raise_count > _MAX_RAISING_CALLS:
+        fail(batch, f"{type(error).__name__}: {error}", error)
+        return ()
+    middle = len(batch) // 2
+    return batch[:middle], batch[middle:]
+
+
+def give_up(batch: RequestBatch, future: Future, fail: Fail) -> None:
+    """Cancels a batch whose answer has not come in time, and fails it."""
+    future.cancel()
+    fail(batch, f"no answer within {batch.source.patience:g} s", None)
+
+
+def valid_part(
+    batch: RequestBatch, answer: Any, fail: Fail
+) -> tuple[RequestBatch, Regions | Bricks] | None:
+    """Checks an answer. A node fails with the first error among its items, and the whole batch if
+    the answer has the wrong form. Returns the other nodes and their items; None if there are none.
+    """
+    try:
+        checked = batch.check(answer)
+    except ValueError as error:
+        fail(batch, str(error), error)
+        return None
+    if checked.errors:
+        reasons: dict[int, str] = {}  # by index in the batch
+        for item in sorted(checked.errors):
+            reasons.setdefault(item // batch.per_node, checked.errors[item])
+        for index, message in reasons.items():
+            fail(batch[index : index + 1], message, None)
+        kept = torch.ones(len(batch), dtype=torch.bool)
+        kept[list(reasons)] = False
+        items = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
+        batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(items)
+    return (batch, checked) if len(batch) else None
 
 
 def brick_words(kind: Tensor) -> Tensor:
