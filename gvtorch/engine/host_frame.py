@@ -65,11 +65,10 @@ class HostFrame(RecordedFrame):
         # Nodes asked for, and failed, since the last `release`.
         self._asked_count = self._failed_count = 0
         self.active = False  # whether frames have been rendered since the last `release`
-        self._lock = threading.Lock()  # held to read or write the five fields below
+        self._lock = threading.Lock()  # held to read or write the four fields below
         self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # deadlines
         self._chosen: dict[int, list[Tensor]] = {kind: [] for kind in KINDS.values()}
         self._last_call = dict.fromkeys(KINDS.values(), -math.inf)  # seconds
-        self._raise_count = 0  # calls that raised since nodes were last taken from `_chosen`
         self._ask_scheduled = False  # whether `_ask_producers` is scheduled
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="gvtorch-ask")
 
@@ -210,7 +209,6 @@ class HostFrame(RecordedFrame):
         """Asks for chosen nodes; of a kind with an answer due, `_CALL_GAP` after its last call."""
         with self._lock:
             self._ask_scheduled, generation, now = False, self.generation, time.monotonic()
-            self._raise_count = 0
             busy_kinds = {batch.kind for _, batch in self._waiting.values()}
             free_kinds = [
                 kind
@@ -264,9 +262,7 @@ class HostFrame(RecordedFrame):
             give_up(batch, future, self._fail)
 
     def _ask_halves(self, batch: RequestBatch, error: Exception) -> None:
-        with self._lock:
-            self._raise_count += 1
-        for half in halves_to_retry(batch, error, self._raise_count, self._fail):
+        for half in halves_to_retry(batch, error, self._fail):
             self._submit(half)
 
     def _settle(self, batch: RequestBatch, get_answer: Callable[[], Any]) -> None:

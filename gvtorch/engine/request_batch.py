@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -17,11 +18,11 @@ from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
 from ..pool import N3Tree, Staging, TableRows
-from ..pool.staging import Shipment, on_host, upload
+from ..pool.staging import SentBricks, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
 
-_MAX_RAISING_CALLS = 256  # calls for a list of requests that may raise before batches are given up
+_MAX_RAISING_CALLS = 256  # for a batch and its parts, which are then given up whole
 
 #: First and last `Region` of the kinds of answers that are written in the same way.
 _WRITTEN_ALIKE = (
@@ -72,6 +73,8 @@ class RequestBatch:
     parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, where needed
     coarse: bool = False  # their bricks take coarse slots
     generation: int | None = None  # of the `HostFrame` that asks; targets are then on the host
+    # Numbers the calls that raise, of this batch and its parts; `next` is safe between threads.
+    raised: Iterator[int] = field(default_factory=partial(itertools.count, 1))
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -141,7 +144,7 @@ class Answered(NamedTuple):
     """A batch and its answer, checked, without items that failed."""
 
     batch: RequestBatch
-    answer: Regions | Bricks | Shipment
+    answer: Regions | Bricks | SentBricks
 
 
 #: Records a batch as failed: the batch, the message, and the error if the producer raised one.
@@ -149,12 +152,12 @@ Fail = Callable[[RequestBatch, str, BaseException | None], None]
 
 
 def halves_to_retry(
-    batch: RequestBatch, error: BaseException, raise_count: int, fail: Fail
+    batch: RequestBatch, error: BaseException, fail: Fail
 ) -> Sequence[RequestBatch]:
     """Returns the halves of a batch for which the producer raised: asked separately, a bad node
     fails alone. A single node fails, and so does the batch after too many calls that raised.
     """
-    if len(batch) == 1 or raise_count > _MAX_RAISING_CALLS:
+    if next(batch.raised) > _MAX_RAISING_CALLS or len(batch) == 1:
         fail(batch, f"{type(error).__name__}: {error}", error)
         return ()
     middle = len(batch) // 2
@@ -258,9 +261,9 @@ def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBa
     return groups
 
 
-def ship_voxels(
+def send_voxels(
     batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
-) -> Regions | Bricks | Shipment:
+) -> Regions | Bricks | SentBricks:
     """Sends a checked answer to the device if it is only voxels, on the host; else returns it."""
     if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
         return answer
@@ -270,7 +273,7 @@ def ship_voxels(
     return staging.send(answer.data)
 
 
-def check_and_ship(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
+def check_and_send(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
     """Sends an answer to the device if it is only valid voxels, on the host; else returns it."""
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
@@ -282,5 +285,5 @@ def check_and_ship(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
         checked = batch.check(answer)
     except ValueError:
         return answer  # the frame reports it
-    shipped = answer if checked.errors else ship_voxels(batch, checked, staging)
-    return shipped if isinstance(shipped, Shipment) else answer
+    sent = answer if checked.errors else send_voxels(batch, checked, staging)
+    return sent if isinstance(sent, SentBricks) else answer
