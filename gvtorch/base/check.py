@@ -141,6 +141,12 @@ def text(context: str, name: str, value: Any) -> str | None:
     return None if value is None else instance(context, name, value, str)
 
 
+def float_dtype(context: str, dtype: Any) -> None:
+    """Raises ValueError unless `dtype` is one of floats."""
+    if not instance(context, "dtype", dtype, torch.dtype).is_floating_point:
+        raise ValueError(f"{context}: dtype must be one of floats, got {dtype}")
+
+
 def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
     """Raises ValueError, which lists the known values, unless `value` is one of them."""
     choices = [*allowed]

@@ -41,7 +41,7 @@ class Octave(NamedTuple):
     seed: int
 
 
-class Tally:
+class EvaluationCounter:
     """Counts evaluations, in a unit that the subclass defines.
 
     Nothing is counted while torch compiles: it treats attributes as constants, and would recompile

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ...base import check
 from .basis import as_points, perlin
-from .fractal import Octave, Tally, octaves_of
+from .fractal import EvaluationCounter, Octave, octaves_of
 
 #: Voxels along each axis that a value is interpolated from.
 POINTS = 6
@@ -73,7 +73,7 @@ def inherit(
     return values.view(-1, side, side, side).permute(0, 3, 1, 2)
 
 
-class OctaveSum(Tally):
+class OctaveSum(EvaluationCounter):
     """The sum of `fbm` in bricks of any level, of the octaves that its voxels represent.
 
     Attributes:

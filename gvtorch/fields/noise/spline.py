@@ -29,12 +29,12 @@ from torch import Tensor
 
 from ...base import check
 from ...ops.reference import noise as twin
-from .fractal import Octave, Tally, octaves_of
+from .fractal import EvaluationCounter, Octave, octaves_of
 
 _TOLERANCE = 1e-6  # relative, of the side of a level's voxels to that of an octave's cells
 
 
-class SplineSum(Tally):
+class SplineSum(EvaluationCounter):
     """A sum of octaves in bricks of any level, in float32: each octave is added in the level whose
     voxels are as wide as its cells. Levels halve their voxels (N = 2).
 
