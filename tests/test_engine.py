@@ -420,7 +420,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: gv.VolumeProducer({}), "VolumeProducer: volume must name at least one"),
         (lambda v: gv.Producer(4, channels={"a": torch.uint8}), "channels['a'] must be a Channel"),
         (lambda v: gv.Engine(type("Lazy", (gv.Producer,), {"__init__": nothing})()), "super()"),
-        (lambda v: engine(v).frame(camera(), VESSELS, channel="b"), "has no channel 'b'; it has"),
+        (lambda v: engine(v).frame(camera(), VESSELS, channel="b"), "'b'; tree 'scene' has"),
         (lambda v: engine(v, cache="1 MB"), "unknown option 'cache'; known: node_pool"),
         (lambda v: engine(v).frame(None, VESSELS), "camera must be a Camera, got NoneType"),
         (

@@ -14,7 +14,7 @@ from helpers import DEVICES
 from helpers.recorded import COMPILED, TRANSFER, Frames, view
 
 import gvtorch as gv
-from gvtorch.engine import host_frame
+from gvtorch.engine import host_frame, request_batch
 from gvtorch.io.stores.conversion import convert
 
 
@@ -232,3 +232,33 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
         assert all(failure.loc[0] == 1 for failure in raised)
         engine.validate()
     assert bool(torch.isfinite(hits.color).all())
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("later", [False, True])
+def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
+    blobs, later, backend, monkeypatch
+):
+    calls = []
+
+    class Never(gv.VolumeProducer):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            calls.append(len(nodes))
+            answer: Future = Future()
+            answer.set_exception(RuntimeError("out of order"))
+            return answer if later else answer.result()
+
+    monkeypatch.setattr(request_batch, "_MAX_RAISING_CALLS", 8)
+    with gv.Engine(Never(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(48), TRANSFER, 64)
+        while not calls:
+            frames.frame()
+            frames.served._executor.submit(int).result()  # until its requests are passed on
+        assert calls[0] > 16
+        assert 8 < len(calls) <= 8 + 7, "each half that was left is asked for once"
+        frames.whole()
+        engine.validate()
+        locs = [failure.loc for failure in engine.failures]
+        assert len(locs) == len(set(locs)) >= calls[0], "each is named once"

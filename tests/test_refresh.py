@@ -269,7 +269,7 @@ def test_mistakes_are_named(blobs):
     for call, message in (
         (
             lambda: tree.to_volume("heat"),
-            "the finest bricks have no channel 'heat'; the tree has v",
+            "unknown channel 'heat'; the tree has v",
         ),
         (lambda: tree.refresh((0, 0, 0)), "box must be (2, 3) numbers"),
         (lambda: tree.refresh([(1, 1, 1), (0, 2, 2)]), "box must be low and high corner"),

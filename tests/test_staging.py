@@ -21,10 +21,10 @@ from gvtorch.pool import BrickTable, Staging, TableRows
 from gvtorch.pool.staging import wide_rows
 
 
-def landed(shipment, channel="value") -> torch.Tensor:
-    """Returns all bricks of a shipment, and releases its bytes."""
+def landed(result, channel="value") -> torch.Tensor:
+    """Returns all bricks of `SentBricks`, and releases its bytes."""
     pieces = []
-    for chunk in shipment.chunks:
+    for chunk in result.chunks:
         with chunk as data:
             pieces.append(data[channel].clone().cpu())
     return torch.cat(pieces)
@@ -55,11 +55,11 @@ def test_what_is_sent_arrives_while_the_ring_wraps_many_times(device):
         row = torch.randint(0, 3000, (count,), generator=torch.Generator().manual_seed(step))
         wide = voxels(count, torch.uint16, 3, seed=step)
         real = voxels(count, torch.float32, 1, seed=step + 1)
-        shipment = ring.send({"value": table[row], "wide": wide, "real": real})
-        assert shipment.sent == count or shipment.chunks
-        assert [chunk.begin for chunk in shipment.chunks][:1] == [0][: len(shipment.chunks)]
-        many = len(shipment.chunks)
-        for chunk in shipment.chunks:
+        result = ring.send({"value": table[row], "wide": wide, "real": real})
+        assert result.sent == count or result.chunks
+        assert [chunk.begin for chunk in result.chunks][:1] == [0][: len(result.chunks)]
+        many = len(result.chunks)
+        for chunk in result.chunks:
             with chunk as data:
                 here = slice(chunk.begin, chunk.end)
                 assert torch.equal(data["value"].cpu(), table.bricks[row[here]])
@@ -67,18 +67,18 @@ def test_what_is_sent_arrives_while_the_ring_wraps_many_times(device):
                 assert torch.equal(data["real"].cpu(), real[here])
         if device.type == "cuda":
             torch.cuda.synchronize()
-        sent += shipment.sent * 11000
-        assert many == 0 or shipment.chunks[-1].end == shipment.sent
+        sent += result.sent * 11000
+        assert many == 0 or result.chunks[-1].end == result.sent
     assert sent > 10 * ring.nbytes
 
 
 def test_a_payload_larger_than_a_chunk_is_cut(device):
     bricks = voxels(6000)
     ring = Staging(6000 * 1000, 1000, device)
-    shipment = ring.send({"value": bricks})
-    assert len(shipment.chunks) > 2 and shipment.sent == 6000 and len(shipment.rest["value"]) == 0
-    assert all(1000 * (chunk.end - chunk.begin) <= ring.chunk for chunk in shipment.chunks)
-    assert torch.equal(landed(shipment), bricks)
+    result = ring.send({"value": bricks})
+    assert len(result.chunks) > 2 and result.sent == 6000 and len(result.rest["value"]) == 0
+    assert all(1000 * (chunk.end - chunk.begin) <= ring.chunk for chunk in result.chunks)
+    assert torch.equal(landed(result), bricks)
 
 
 def test_a_full_ring_takes_fewer_bricks_and_waits_for_none(device):
@@ -99,40 +99,40 @@ def test_a_full_ring_takes_fewer_bricks_and_waits_for_none(device):
 def test_what_nobody_reads_any_more_gives_its_bytes_back(device):
     ring = Staging(4_000_000, 1000, device)
     for _ in range(5):
-        shipment = ring.send({"value": voxels(8000)})
-        assert shipment.sent > 4000
+        result = ring.send({"value": voxels(8000)})
+        assert result.sent > 4000
         if device.type == "cuda":
             torch.cuda.synchronize()
-        del shipment  # an interrupted frame
+        del result  # an interrupted frame
 
 
 def test_a_brick_larger_than_a_chunk_has_a_ring_of_its_size(device):
     bricks = voxels(5, torch.float32, 4, side=80)
     ring = Staging(1000, bricks[0].nbytes, device)
-    shipment = ring.send({"value": bricks})
-    assert shipment.sent == 4
-    assert torch.equal(landed(shipment), bricks[:4])
+    result = ring.send({"value": bricks})
+    assert result.sent == 4
+    assert torch.equal(landed(result), bricks[:4])
 
 
 @pytest.mark.parametrize("device", [pytest.param("cuda", marks=pytest.mark.backend("cuda"))])
 def test_pinned_bricks_are_copied_from_where_they_are(device):
     ring = Staging(8_000_000, 1000, torch.device(device))
     bricks = voxels(5000).pin_memory()
-    shipment = ring.send({"value": bricks, "pageable": voxels(5000, seed=3)})
+    result = ring.send({"value": bricks, "pageable": voxels(5000, seed=3)})
     expected = bricks.clone()
     del bricks  # the source of the copy lives until then
     junk = [torch.full((2_500_000,), 7, dtype=torch.uint8).pin_memory() for _ in range(4)]
-    assert shipment.sent == len(expected) - len(shipment.rest["value"]) > 1000 and len(junk) == 4
-    assert torch.equal(landed(shipment), expected[: shipment.sent])
+    assert result.sent == len(expected) - len(result.rest["value"]) > 1000 and len(junk) == 4
+    assert torch.equal(landed(result), expected[: result.sent])
 
 
 def test_several_threads_may_send(device):
     ring = Staging(40_000_000, 1000, device)
     batches = [voxels(1500, seed=seed) for seed in range(12)]
     with ThreadPoolExecutor(4) as threads:
-        shipments = list(threads.map(lambda b: ring.send({"value": b}), batches))
-    for shipment, bricks in zip(shipments, batches, strict=True):
-        assert torch.equal(landed(shipment), bricks)
+        results = list(threads.map(lambda b: ring.send({"value": b}), batches))
+    for result, bricks in zip(results, batches, strict=True):
+        assert torch.equal(landed(result), bricks)
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.bfloat16, torch.float32])

@@ -251,7 +251,7 @@ def test_ctrl_c_leaves_the_file_that_was_there(tmp_path):
         (lambda v, t: gv.extract_surface(v, 0, channel="heat"), "channel is for trees"),
         (
             lambda v, t: gv.extract_surface(gv.N3Tree.from_volume(v), 0, channel="heat"),
-            "no channel",
+            "unknown channel",
         ),
         (lambda v, t: gv.extract_surface(7, 0), "what must be a Volume, Store or N3Tree, got int"),
         (lambda v, t: gv.export_surface(v, 0, t / "s.obj"), "path must end in .ply or .glb"),

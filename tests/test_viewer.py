@@ -140,7 +140,7 @@ def test_a_state_that_can_not_be_drawn_gives_way_to_the_last_that_could(session)
             }
         },
     )
-    assert "has no channel 'none'" in page.next("error", 0)["text"]
+    assert "unknown channel 'none'" in page.next("error", 0)["text"]
     page.until(
         lambda: (
             page.of_type("state")

@@ -12,7 +12,7 @@ import operator
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -141,6 +141,12 @@ def text(context: str, name: str, value: Any) -> str | None:
     return None if value is None else instance(context, name, value, str)
 
 
+def float_dtype(context: str, dtype: Any) -> None:
+    """Raises ValueError unless `dtype` is one of floats."""
+    if not instance(context, "dtype", dtype, torch.dtype).is_floating_point:
+        raise ValueError(f"{context}: dtype must be one of floats, got {dtype}")
+
+
 def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
     """Raises ValueError, which lists the known values, unless `value` is one of them."""
     choices = [*allowed]
@@ -148,6 +154,14 @@ def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
         *others, last = map(repr, choices or [None])
         listing = f"{', '.join(others)} or {last}" if others else last
         raise ValueError(f"{context}: {name} must be {listing}, got {value!r}")
+
+
+def channel(context: str, name: str, channels: Collection[str], owner: str = "the tree") -> None:
+    """Raises ValueError unless `name` is one of the `channels` of an `owner`."""
+    if name not in channels:
+        raise ValueError(
+            f"{context}: unknown channel {quoted(name)}; {owner} has {', '.join(channels)}"
+        )
 
 
 def known_options(context: str, options: Mapping[str, Any], typed_dict: type) -> None:

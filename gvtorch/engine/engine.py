@@ -228,7 +228,7 @@ class Engine(FrameSteps):
         return hits, total
 
     def _served_frame(self, view: View, again: Again | None = None) -> tuple[Hits, FrameStats]:
-        """Renders a frame and serves its own requests before it ends."""
+        """Runs the stages of `frame`, for rays `again` if given; then serves its own requests."""
         with self.new_frame(view.options) as stats:
             self.serve_last_frame(stats)
             if again is None:

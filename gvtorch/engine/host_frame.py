@@ -31,7 +31,15 @@ from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
 from .production import Production
 from .recorded import RecordedFrame, SlotCounts
-from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
+from .request_batch import (
+    ProducedTree,
+    RequestBatch,
+    brick_words,
+    children_of,
+    give_up,
+    halves_to_retry,
+    valid_part,
+)
 from .stats import Collected, FrameStats
 from .upload_queue import RowForm, UploadQueue
 
@@ -254,14 +262,10 @@ class HostFrame(RecordedFrame):
             for future in overdue:
                 del self._waiting[future]
         for future, batch in overdue.items():
-            future.cancel()
-            self._fail(batch, f"no answer within {batch.source.patience:g} s")
+            give_up(batch, future, self._fail)
 
     def _ask_halves(self, batch: RequestBatch, error: Exception) -> None:
-        if len(batch) == 1:
-            self._fail(batch, f"{type(error).__name__}: {error}", error)
-            return
-        for half in batch.halves():
+        for half in halves_to_retry(batch, error, self._fail):
             self._submit(half)
 
     def _settle(self, batch: RequestBatch, get_answer: Callable[[], Any]) -> None:
@@ -273,18 +277,14 @@ class HostFrame(RecordedFrame):
         except Exception as error:
             self._ask_halves(batch, error)
             return
-        try:
-            checked = batch.check(answer)
-            reasons, kept = batch.node_errors(checked)
-            for index, message in reasons.items():
-                self._fail(batch[index : index + 1], message)
-            kept_index = kept.nonzero()[:, 0]
-            if isinstance(checked, Regions):
-                self._queue_tiles(batch, checked, kept_index)
-            else:
-                self._queue_bricks(batch, checked, kept_index)
-        except ValueError as error:
-            self._fail(batch, str(error), error)
+        valid = valid_part(batch, answer, self._fail)
+        if valid is None:
+            return
+        valid_batch, checked = valid
+        if isinstance(checked, Regions):
+            self._queue_tiles(valid_batch, checked)
+        else:
+            self._queue_bricks(valid_batch, checked)
 
     def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
         """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
@@ -293,9 +293,9 @@ class HostFrame(RecordedFrame):
                 self._failed_count += len(batch)
                 self._production.failures.add(batch, message, cause)
 
-    def _queue_tiles(self, batch: RequestBatch, answer: Regions, kept_index: Tensor) -> None:
+    def _queue_tiles(self, batch: RequestBatch, answer: Regions) -> None:
         if answer.alias is not None:
-            self._leave_to_host(batch[kept_index])
+            self._leave_to_host(batch)
             return
         children, targets = children_of(batch, answer, self.cache), batch.targets
         rows = {
@@ -305,9 +305,9 @@ class HostFrame(RecordedFrame):
             "brick": children.brick,
         }
         fields = {"constants": children.constants, "ranges": children.ranges}
-        self._queue(batch, "tiles", rows, fields, kept_index)
+        self._queue(batch, "tiles", rows, fields)
 
-    def _queue_bricks(self, batch: RequestBatch, answer: Bricks, kept_index: Tensor) -> None:
+    def _queue_bricks(self, batch: RequestBatch, answer: Bricks) -> None:
         fields: dict[str, Mapping[str, Any]]
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
@@ -317,26 +317,26 @@ class HostFrame(RecordedFrame):
         }
         fields = {"data": data}
         if kind is None:
-            self._queue(batch, "bricks", rows, fields, kept_index)
+            self._queue(batch, "bricks", rows, fields)
             return
-        is_alias = kind[kept_index] == Region.ALIAS
+        is_alias = kind == Region.ALIAS
         if bool(is_alias.any()):
-            self._leave_to_host(batch[kept_index[is_alias]])
+            self._leave_to_host(batch[is_alias])
         brick_word = brick_words(kind)
-        is_uniform = brick_word[kept_index] != ABSENT
-        self._queue(batch, "bricks", rows, fields, kept_index[~is_uniform & ~is_alias])
+        is_uniform = brick_word != ABSENT
+        self._queue(batch, "bricks", rows, fields, ~is_uniform & ~is_alias)
         zeros = {
             name: torch.zeros((len(kind), channel.width), dtype=channel.dtype)
             for name, channel in batch.source.producer.channels.items()
         }
         fields = {"constants": {**zeros, **answer.constants}}
-        self._queue(batch, "uniform", {**rows, "word": brick_word}, fields, kept_index[is_uniform])
+        self._queue(batch, "uniform", {**rows, "word": brick_word}, fields, is_uniform)
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
         bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
-        self._queue(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {}, slice(None))
+        self._queue(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {})
 
     def _queue(
         self,
@@ -344,10 +344,11 @@ class HostFrame(RecordedFrame):
         table: str,
         rows: Mapping[str, Tensor],
         fields: Mapping[str, Mapping[str, Tensor]],
-        index: Tensor | slice,
+        index: Tensor | None = None,
     ) -> None:
-        """Queues entries `index` of `rows`, and of `fields` by channel. A node may be queued only
-        once; those of an earlier generation are dropped: they may have been requested again.
+        """Queues copies of the entries `index`, or all, of `rows`, and of `fields` by channel. A
+        node may be queued only once; those of an earlier generation are dropped: they may have been
+        requested again.
         """
         flat_fields = {
             f"{name}.{channel}": values
@@ -356,7 +357,7 @@ class HostFrame(RecordedFrame):
         }
         queue = self._uploads[self._upload_index[batch.source.tree.number]]
         selected = {
-            name: movable(values)[index].view(values.dtype)
+            name: values.clone() if index is None else movable(values)[index].view(values.dtype)
             for name, values in {**rows, **flat_fields}.items()
         }
         with self._lock:

@@ -55,9 +55,9 @@ def parent_bricks(cache: Cache, source: ProducedTree, node: Tensor) -> dict[str,
 
 
 def unlink_alias_only(cache: Cache, node: Tensor) -> Tensor:
-    """Returns (k,) bool, which of (k,) nodes lie in tiles with a known parent, or in a root tile.
-    The other tiles are reached through aliases only: they are unlinked, so that rays ask for them
-    again where they belong.
+    """Unlinks those tiles of (k,) nodes that are reached through aliases only: they have no known
+    parent, and rays ask for them again where they belong. Returns (k,) bool: which nodes lie in
+    other tiles.
     """
     tile = node // cache.nodes.nodes_per_tile
     has_parent = (cache.nodes.parent_t[tile] >= 0) | (tile < len(cache.aliases.trees))

@@ -22,7 +22,7 @@ from ..cache import KINDS, Cache, RequestList, Scheduler, write
 from ..cache.requests import Requests, coarser_requests, extra_levels, levels_wanted, requests_below
 from ..cache.write import Targets, Written
 from ..pool import Staging
-from ..pool.staging import Shipment, upload
+from ..pool.staging import SentBricks, upload
 from ..producers import Bricks, Region, Regions
 from . import parents
 from .request_batch import (
@@ -31,13 +31,15 @@ from .request_batch import (
     RequestBatch,
     brick_words,
     by_kind,
-    check_and_ship,
+    check_and_send,
     children_of,
-    ship_voxels,
+    give_up,
+    halves_to_retry,
+    send_voxels,
+    valid_part,
 )
 from .stats import Counts, FrameStats
 
-_MAX_RAISING_CALLS = 256  # calls in one frame that may raise before whole batches are given up
 _MAX_WAIT_SECONDS = 1e6  # seconds
 _MAX_NAMED_FAILURES = 1000  # most failures kept by name; all are counted
 
@@ -120,13 +122,12 @@ class _PendingBatch:
     batch: RequestBatch
     producer_future: Future  # what the producer returned
     answer_future: Future  # of the same answer, after bricks on the host were checked and sent
-    patience: float  # seconds
     asked_at: float  # time.monotonic()
 
     @property
     def seconds_left(self) -> float:
         """Seconds until it is given up."""
-        return self.asked_at + self.patience - time.monotonic()
+        return self.asked_at + self.batch.source.patience - time.monotonic()
 
 
 def _try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
@@ -151,7 +152,7 @@ class Production:
         self.cache, self.scheduler, self.by_level = cache, scheduler, by_level
         self.trees: dict[str, ProducedTree] = {}
         self.failures = Failures(strict)
-        self._raise_count = self._skipped_count = 0
+        self._skipped_count = 0
         self._waiting: list[_PendingBatch] = []
         self._held_back: list[Answered] = []  # found no room in the staging ring
         self.staging: Staging | None = None
@@ -226,7 +227,6 @@ class Production:
 
     def ask(self, chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
-        self._raise_count = 0
         answered: list[Answered] = []
         for kind, nodes in chosen.items():
             self.scheduler.spent[kind] += len(nodes)
@@ -256,8 +256,7 @@ class Production:
                 self._waiting.remove(item)
             elif item.seconds_left < 0:
                 self._waiting.remove(item)
-                item.producer_future.cancel()
-                self._fail(item.batch, f"no answer within {item.patience:g} s")
+                give_up(item.batch, item.producer_future, self._fail)
         return answered
 
     def write(self, answers: Sequence[Answered], stats: FrameStats) -> None:
@@ -267,8 +266,8 @@ class Production:
             if isinstance(answer, Regions):
                 children = children_of(batch, answer, self.cache)
                 self._count_written(batch, write.tiles(self.cache, batch.targets, children), stats)
-            elif isinstance(answer, Shipment):
-                self._write_shipment(batch, answer, stats)
+            elif isinstance(answer, SentBricks):
+                self._write_sent(batch, answer, stats)
             else:
                 for kind, part in by_kind(batch, answer).items():
                     self._write_bricks(kind, *part, stats)
@@ -357,17 +356,15 @@ class Production:
         if isinstance(answer, Future):
             if not answer.done():
                 self._mark(batch)
-                future, patience = self._ship_on_arrival(batch, answer), batch.source.patience
-                self._waiting.append(
-                    _PendingBatch(batch, answer, future, patience, time.monotonic())
-                )
+                future = self._send_on_arrival(batch, answer)
+                self._waiting.append(_PendingBatch(batch, answer, future, time.monotonic()))
                 return []
             answer, raised = _try_call(answer.result)
         answered = self._settle(batch, answer, raised)
         self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
         return answered
 
-    def _ship_on_arrival(self, batch: RequestBatch, producer_future: Future) -> Future:
+    def _send_on_arrival(self, batch: RequestBatch, producer_future: Future) -> Future:
         """Returns a future of the answer, after sending bricks on the host to the device."""
         staging = self.staging
         if staging is None or batch.kind != REQUEST_LOAD:
@@ -376,7 +373,7 @@ class Production:
 
         def send(done_future: Future) -> None:
             try:
-                answer_future.set_result(check_and_ship(batch, done_future.result(), staging))
+                answer_future.set_result(check_and_send(batch, done_future.result(), staging))
             except BaseException as error:
                 answer_future.set_exception(error)
 
@@ -386,25 +383,12 @@ class Production:
     def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
         """Checks an answer; if the producer raised, asks it again for each half of the batch."""
         if raised is not None:
-            self._raise_count += 1
-            if len(batch) == 1 or self._raise_count > _MAX_RAISING_CALLS:
-                self._fail(batch, f"{type(raised).__name__}: {raised}", raised)
-                return []
-            return [answered for half in batch.halves() for answered in self._submit(half)]
-        if isinstance(answer, Shipment):
+            halves = halves_to_retry(batch, raised, self._fail)
+            return [answered for half in halves for answered in self._submit(half)]
+        if isinstance(answer, SentBricks):
             return [Answered(batch, answer)]
-        try:
-            checked = batch.check(answer)
-        except ValueError as error:
-            self._fail(batch, str(error), error)
-            return []
-        if checked.errors:
-            reasons, kept = batch.node_errors(checked)
-            for index, message in reasons.items():
-                self._fail(batch[index : index + 1], message)
-            rows = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
-            batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(rows)
-        return [Answered(batch, ship_voxels(batch, checked, self.staging))] if len(batch) else []
+        valid = valid_part(batch, answer, self._fail)
+        return [] if valid is None else [Answered(valid[0], send_voxels(*valid, self.staging))]
 
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
@@ -422,22 +406,20 @@ class Production:
             written = write.uniform(self.cache, batch.targets, brick_word, constants)
             self._count_written(batch, written, stats)
             return
-        shipped = ship_voxels(batch, answer, self.staging)
-        if isinstance(shipped, Shipment):
-            self._write_shipment(batch, shipped, stats)
+        sent = send_voxels(batch, answer, self.staging)
+        if isinstance(sent, SentBricks):
+            self._write_sent(batch, sent, stats)
         else:
             self._count_written(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
 
-    def _write_shipment(self, batch: RequestBatch, shipment: Shipment, stats: FrameStats) -> None:
+    def _write_sent(self, batch: RequestBatch, bricks: SentBricks, stats: FrameStats) -> None:
         """Writes the bricks that are being sent to the device; holds back those without room."""
-        sent, held_back = batch[: shipment.sent], batch[shipment.sent :]
+        sent, held_back = batch[: bricks.sent], batch[bricks.sent :]
         if len(held_back):
             self._mark(held_back)
-            self._held_back.append(Answered(held_back, Bricks(data=shipment.rest)))
+            self._held_back.append(Answered(held_back, Bricks(data=bricks.rest)))
         if len(sent):
-            self._count_written(
-                sent, write.bricks(self.cache, sent.targets, shipment.chunks), stats
-            )
+            self._count_written(sent, write.bricks(self.cache, sent.targets, bricks.chunks), stats)
 
     def _count_written(self, batch: RequestBatch, written: Written, stats: FrameStats) -> None:
         """Adds a write to `stats`; nodes that found no slot may be requested again."""
@@ -459,7 +441,7 @@ class Production:
         lacking = batch.targets.lacking(self.cache, batch.kind)
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 
-    def _fail(self, batch: RequestBatch, message: str, cause: Exception | None = None) -> None:
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
         """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         self._mark(batch)
         self.failures.add(batch, message, cause)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -16,9 +18,11 @@ from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
 from ..pool import N3Tree, Staging, TableRows
-from ..pool.staging import Shipment, on_host, upload
+from ..pool.staging import SentBricks, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
+
+_MAX_RAISING_CALLS = 256  # for a batch and its parts, which are then given up whole
 
 #: First and last `Region` of the kinds of answers that are written in the same way.
 _WRITTEN_ALIKE = (
@@ -69,6 +73,8 @@ class RequestBatch:
     parents: Mapping[str, Tensor] | None = None  # (k, z, y, x, c) bricks, where needed
     coarse: bool = False  # their bricks take coarse slots
     generation: int | None = None  # of the `HostFrame` that asks; targets are then on the host
+    # Numbers the calls that raise, of this batch and its parts; `next` is safe between threads.
+    raised: Iterator[int] = field(default_factory=partial(itertools.count, 1))
 
     def __len__(self) -> int:
         return len(self.targets)
@@ -86,11 +92,6 @@ class RequestBatch:
                 part = self if size == len(self) else self[row]
                 parts.append(replace(part, coarse=mask is coarse))
         return parts
-
-    def halves(self) -> tuple[RequestBatch, RequestBatch]:
-        """Returns the first half, and the rest: asked separately, a bad node fails alone."""
-        middle = len(self) // 2
-        return self[:middle], self[middle:]
 
     def __getitem__(self, index: slice | Tensor) -> RequestBatch:
         if isinstance(index, Tensor):
@@ -122,17 +123,6 @@ class RequestBatch:
         """How many items an answer has for each node of the batch."""
         return len(self.loc) // len(self)
 
-    def node_errors(self, answer: Regions | Bricks) -> tuple[dict[int, str], Tensor]:
-        """Returns why nodes failed, by index in the batch: the first error among a node's items;
-        and (k,) bool, which nodes did not fail.
-        """
-        reasons: dict[int, str] = {}
-        for index in sorted(answer.errors):
-            reasons.setdefault(index // self.per_node, answer.errors[index])
-        kept = torch.ones(len(self), dtype=torch.bool)
-        kept[list(reasons)] = False
-        return reasons, kept
-
     def alias_tree(self, answer: Regions | Bricks) -> int:
         """Number of the tree in which the alias targets of an answer lie."""
         name, layout = answer.alias_tree, self.source.layout
@@ -154,7 +144,54 @@ class Answered(NamedTuple):
     """A batch and its answer, checked, without items that failed."""
 
     batch: RequestBatch
-    answer: Regions | Bricks | Shipment
+    answer: Regions | Bricks | SentBricks
+
+
+#: Records a batch as failed: the batch, the message, and the error if the producer raised one.
+Fail = Callable[[RequestBatch, str, BaseException | None], None]
+
+
+def halves_to_retry(
+    batch: RequestBatch, error: BaseException, fail: Fail
+) -> Sequence[RequestBatch]:
+    """Returns the halves of a batch for which the producer raised: asked separately, a bad node
+    fails alone. A single node fails, and so does the batch after too many calls that raised.
+    """
+    if next(batch.raised) > _MAX_RAISING_CALLS or len(batch) == 1:
+        fail(batch, f"{type(error).__name__}: {error}", error)
+        return ()
+    middle = len(batch) // 2
+    return batch[:middle], batch[middle:]
+
+
+def give_up(batch: RequestBatch, future: Future, fail: Fail) -> None:
+    """Cancels a batch whose answer has not come in time, and fails it."""
+    future.cancel()
+    fail(batch, f"no answer within {batch.source.patience:g} s", None)
+
+
+def valid_part(
+    batch: RequestBatch, answer: Any, fail: Fail
+) -> tuple[RequestBatch, Regions | Bricks] | None:
+    """Checks an answer. A node fails with the first error among its items, and the whole batch if
+    the answer has the wrong form. Returns the other nodes and their items; None if there are none.
+    """
+    try:
+        checked = batch.check(answer)
+    except ValueError as error:
+        fail(batch, str(error), error)
+        return None
+    if checked.errors:
+        reasons: dict[int, str] = {}  # by index in the batch
+        for item in sorted(checked.errors):
+            reasons.setdefault(item // batch.per_node, checked.errors[item])
+        for index, message in reasons.items():
+            fail(batch[index : index + 1], message, None)
+        kept = torch.ones(len(batch), dtype=torch.bool)
+        kept[list(reasons)] = False
+        items = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
+        batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(items)
+    return (batch, checked) if len(batch) else None
 
 
 def brick_words(kind: Tensor) -> Tensor:
@@ -224,9 +261,9 @@ def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBa
     return groups
 
 
-def ship_voxels(
+def send_voxels(
     batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
-) -> Regions | Bricks | Shipment:
+) -> Regions | Bricks | SentBricks:
     """Sends a checked answer to the device if it is only voxels, on the host; else returns it."""
     if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):
         return answer
@@ -236,7 +273,7 @@ def ship_voxels(
     return staging.send(answer.data)
 
 
-def check_and_ship(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
+def check_and_send(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
     """Sends an answer to the device if it is only valid voxels, on the host; else returns it."""
     data = answer.data if isinstance(answer, Bricks) else answer
     if not isinstance(data, Mapping) or not all(
@@ -248,5 +285,5 @@ def check_and_ship(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
         checked = batch.check(answer)
     except ValueError:
         return answer  # the frame reports it
-    shipped = answer if checked.errors else ship_voxels(batch, checked, staging)
-    return shipped if isinstance(shipped, Shipment) else answer
+    sent = answer if checked.errors else send_voxels(batch, checked, staging)
+    return sent if isinstance(sent, SentBricks) else answer

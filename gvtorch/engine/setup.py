@@ -17,7 +17,7 @@ from ..cache.write import write_slots
 from ..io.resources import amount, memory_free
 from ..pool import BrickPool, Channel, N3Tree, NodePool
 from ..producers import Layout, Nodes, Producer, Region
-from ..producers.answer import checked_bricks, checked_regions
+from ..producers.answer import checked_bricks, checked_regions, raise_first
 from .device_frame import DeviceFrame
 from .host_frame import HostFrame
 from .production import Production, ProductionError
@@ -261,13 +261,13 @@ def fill_root(cache: Cache, source: ProducedTree) -> None:
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
     root = Nodes(loc, source.layout, coarse=bool(cache.finest[tile] > 0))
     regions = checked_regions(source.wait(producer.classify(root)), root, producer)
-    _raise_first(regions.errors)
+    raise_first(regions.errors)
     for channel, tensor in regions.ranges.items():
         movable(nodes.ranges[channel])[tile, 0] = movable(tensor)[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
         bricks = checked_bricks(source.wait(producer.fill(root)), root, producer)
-        _raise_first(bricks.errors)
+        raise_first(bricks.errors)
         brick_kind = kind if bricks.kind is None else Region(int(bricks.kind[0]))
         if brick_kind not in (Region.DATA, Region.DATA_MAX_DEPTH):
             kind, constants = brick_kind, bricks.constants
@@ -282,11 +282,6 @@ def fill_root(cache: Cache, source: ProducedTree) -> None:
         nodes.child_tn.view(-1)[index] = ABSENT
     slot = torch.tensor([tile], device=root.loc.device)
     write_slots(cache, slot, slot * nodes.nodes_per_tile, bricks.data)
-
-
-def _raise_first(errors: Mapping[int, str]) -> None:
-    for message in errors.values():
-        raise ValueError(message)
 
 
 def make_recorded_frame(

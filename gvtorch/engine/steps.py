@@ -23,6 +23,7 @@ from .production import Production
 from .ray_subsets import scouts
 from .recorded import RecordedFrame
 from .renewal import renew_tree
+from .request_batch import ProducedTree
 from .setup import EngineOptions, brick_bytes, make_pools, make_tree
 from .stats import Collected, Counts, FrameStats, Readback, Readbacks
 
@@ -135,11 +136,7 @@ class FrameSteps:
         """Drops nodes and bricks that producers have reported as changed (`Producer.changed`), and
         remakes the roots of their trees; the host waits for that. The next frames make the rest.
         """
-        changed = [
-            source
-            for name, source in self.trees.items()
-            if source.producer.version != self._versions[name]
-        ]
+        changed = self._changed_trees()
         if not changed:
             return
         self.release()
@@ -226,9 +223,11 @@ class FrameSteps:
     @property
     def changed(self) -> bool:
         """Whether a producer's content has changed since its tree was last renewed."""
-        return any(
-            source.producer.version != self._versions[name] for name, source in self.trees.items()
-        )
+        return bool(self._changed_trees())
+
+    def _changed_trees(self) -> list[ProducedTree]:
+        sources = self.trees.values()
+        return [s for s in sources if s.producer.version != self._versions[s.name]]
 
     def close(self) -> None:
         """Waits for the frame that another thread is rendering, then drops all answers on their way

@@ -277,7 +277,7 @@ class Difference(Intersection):
 
 
 class SmoothIntersection(Negative):
-    """The intersection, blended as `SmoothUnion`."""
+    """The intersection; its edge is blended as in `SmoothUnion`."""
 
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
         """Sets the shapes and the width of the blend, see `SmoothUnion`."""
@@ -292,7 +292,7 @@ class SmoothIntersection(Negative):
 
 
 class SmoothDifference(SmoothIntersection):
-    """The difference, blended as `SmoothUnion`."""
+    """The first shape without the second; the edge is blended as in `SmoothUnion`."""
 
     def __init__(self, first: Distance, second: Distance, width: float) -> None:
         """Sets the shapes and the width of the blend, see `SmoothUnion`."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import warnings
 from typing import Any
 
 import torch
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.volume import Volume
-from ..meshes.holes import SolidParts, warning_of_holes
+from ..meshes.holes import SolidParts, warn_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import Voxelizer
 from .distance import WHITE, Color, Distance
@@ -87,8 +86,7 @@ class SampledDistance(Distance):
             ValueError: A number is out of its range.
         """
         check.instance("SampledDistance", "mesh", mesh, Mesh)
-        if solid == "auto" and (message := warning_of_holes(mesh)):
-            warnings.warn(message, stacklevel=2)
+        warn_of_holes(mesh, solid, stacklevel=2)
         reach = check.number("SampledDistance", "reach", reach, low=0, high=4)
         settings: dict[str, Any] = {"channels": ("distance",), "band": _BAND, "solid": solid}
         grid = Voxelizer(mesh, resolution=resolution, **settings)

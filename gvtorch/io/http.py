@@ -316,7 +316,7 @@ class _Connections:
             self._waiting[connection] = time.monotonic(), sock
 
     def shut_down_silent(self, before: float) -> None:
-        """Shuts down connections that were silent since `before`; reading from them fails."""
+        """Shuts down connections that have sent nothing since `before`: reading from them fails."""
         with self._lock:
             silent = [sock for since, sock in self._waiting.values() if since < before]
         for sock in silent:

@@ -9,13 +9,12 @@ import functools
 import json
 import multiprocessing
 import threading
-import warnings
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Unpack, get_args
+from typing import Any, Unpack
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ import torch
 from ..base import check
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
-from ..meshes.holes import SolidParts, solid_when_filled, warning_of_holes
+from ..meshes.holes import SolidParts, warn_of_holes
 from ..meshes.mesh import Material, Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer, check_channels
 from .mesh_file import read_mesh
@@ -41,8 +40,8 @@ class MeshSource(VolumeSource):
     """One channel of a mesh's finest voxels."""
 
     channel: str
-    settings: tuple[tuple[str, Any], ...]  # resolution, band and thickness
-    solid: SolidParts
+    settings: tuple[tuple[str, Any], ...]  # `Voxelizer.settings`
+    solid: SolidParts  # as the user chose
     identity: tuple[Any, ...]  # of mesh and settings: equal while these are unchanged
     command_options: tuple[str, ...] = ()  # options of the command line that makes the store
     one_of_several: bool = False  # whether its store is one of several, one per channel
@@ -55,16 +54,14 @@ class MeshSource(VolumeSource):
         mesh_or_path: str | Path | Mesh,
         channels: str | Sequence[str] = "coverage",
         *,
-        resolution: int = 1024,
-        band: float = 4.0,
-        thickness: float = 1.0,
-        solid: SolidParts = "auto",
         texture: str | Path | None = None,
+        **settings: Unpack[GridSettings],
     ) -> dict[str, MeshSource]:
         """Reads a mesh, lays a grid around it, and returns a source per channel; see `voxelize`."""
-        check.integer("voxelize", "resolution", resolution, low=8, high=2**20)
+        solid = settings.get("solid", "auto")
+        if "resolution" in settings:  # all voxels are made, not only those that are seen
+            check.integer("voxelize", "resolution", settings["resolution"], low=8, high=2**20)
         check.instance("voxelize", "mesh", mesh_or_path, Mesh, str, PathLike)
-        check.one_of("voxelize", "solid", solid, get_args(SolidParts))
         names = check_channels("voxelize", channels)
         if isinstance(mesh_or_path, Mesh):
             if texture is not None:
@@ -76,13 +73,12 @@ class MeshSource(VolumeSource):
                 fingerprint(mesh_or_path),
                 str(mesh_or_path),
             )
-        if solid == "auto" and (hole_warning := warning_of_holes(mesh)):
-            warnings.warn(hole_warning, stacklevel=3)
+        warn_of_holes(mesh, solid, stacklevel=3)
         identity.insert(0, checksum(v for name, v in _mesh_arrays(mesh).items() if name != "name"))
-        settings: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
-        voxelizer = Voxelizer(mesh, channels=names, **settings, solid=solid)
-        setting_options = [word for key, n in settings.items() for word in (f"--{key}", f"{n:g}")]
-        options = ("--channels", ",".join(names), *setting_options, "--solid", solid)
+        voxelizer = Voxelizer(mesh, channels=names, **settings)
+        numbers = [(name, n) for name, n in voxelizer.settings.items() if name != "solid"]
+        number_options = [word for name, n in numbers for word in (f"--{name}", f"{n:g}")]
+        options = ("--channels", ",".join(names), *number_options, "--solid", solid)
         sources = {}
         for channel in names:
             dtype, width = CHANNELS[channel]
@@ -97,7 +93,7 @@ class MeshSource(VolumeSource):
                 origin=voxelizer.origin,
                 info=ImageInfo(channels=colors, quantity=channel, labels=channel == "material"),
                 channel=channel,
-                settings=tuple(settings.items()),
+                settings=tuple(voxelizer.settings.items()),
                 solid=solid,
                 identity=tuple(identity),
                 command_options=options
@@ -118,7 +114,8 @@ class MeshSource(VolumeSource):
 
     def fingerprint(self) -> list[Any]:
         """Returns values that identify the mesh, the channel and the settings."""
-        return [*self.identity, self.channel, *(n for _, n in self.settings), self.solid]
+        settings = {**dict(self.settings), "solid": self.solid}
+        return [*self.identity, self.channel, *settings.values()]
 
     def command(self, store: str) -> tuple[str, ...]:
         """Returns the words of the `gvtorch voxelize` command that makes a store of it."""
@@ -141,12 +138,7 @@ def _voxelizer(source: MeshSource) -> Voxelizer:
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)  # one of several processes that share the cores
     mesh = _load_mesh(Path(source.file)) if source.mesh is None else source.mesh
-    return Voxelizer(
-        mesh,
-        channels=(source.channel,),
-        solid=solid_when_filled(source.solid),
-        **dict(source.settings),
-    )
+    return Voxelizer(mesh, channels=(source.channel,), **dict(source.settings))
 
 
 def voxelize(

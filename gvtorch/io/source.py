@@ -16,7 +16,7 @@ import os
 import re
 import zipfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -261,6 +261,18 @@ class MemorySource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]
+
+
+def read_planes(
+    index: Index, count: int, stored: str, read: Callable[[tuple[int, ...]], np.ndarray]
+) -> np.ndarray:
+    """Returns the part `index` of an array of dtype `stored` that is read plane by plane: `read`
+    gets a position along the first `count` axes, and returns the part `index[count:]` there.
+    """
+    data = np.empty([span.stop - span.start for span in index], stored)
+    for offset in np.ndindex(data.shape[:count]):
+        data[offset] = read(tuple(s.start + n for s, n in zip(index, offset, strict=False)))
+    return data
 
 
 def place_axes(

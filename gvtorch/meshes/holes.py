@@ -7,6 +7,7 @@ Source: Jacobson, Kavan, Sorkine-Hornung, "Robust inside-outside segmentation us
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -123,9 +124,12 @@ def warning_of_holes(mesh: Mesh) -> str:
     )
 
 
-def solid_when_filled(solid: SolidParts) -> SolidParts:
-    """Returns `solid` for a mesh whose holes are filled already."""
-    return "auto" if solid == "always" else solid
+def warn_of_holes(mesh: Mesh, solid: str, stacklevel: int) -> None:
+    """Issues `warning_of_holes` where it matters: if closed parts alone are to be solids ("auto").
+    `stacklevel` is as in `warnings.warn`: 2 is the line that called this function's caller.
+    """
+    if solid == "auto" and (message := warning_of_holes(mesh)):
+        warnings.warn(message, stacklevel=stacklevel + 1)
 
 
 def filled(mesh: Mesh) -> Mesh:

@@ -62,7 +62,8 @@ class Voxelizer:
     origin + (x + 1/2) * spacing.
 
     Attributes:
-        mesh: The mesh.
+        mesh: The mesh, its holes filled if `solid` was "always".
+        settings: Arguments with which `mesh` gives the same voxels: "auto" in place of "always".
         extent: Finest voxels along x, y, z.
         spacing: World size of a finest voxel, the same along x, y and z.
         origin: World position of the centre of voxel 0.
@@ -110,7 +111,14 @@ class Voxelizer:
         check.integer(context, "resolution", resolution, low=8, high=2**30)
         check.one_of(context, "solid", solid, get_args(SolidParts))
         channels = check_channels(context, channels)
-        mesh = filled(mesh) if solid == "always" else mesh
+        if solid == "always":
+            mesh, solid = filled(mesh), "auto"
+        self.settings: GridSettings = {
+            "resolution": resolution,
+            "band": band,
+            "thickness": thickness,
+            "solid": solid,
+        }
         if "material" in channels and len(mesh.materials) > 255:
             raise ValueError(
                 f"{mesh.name}: {len(mesh.materials)} materials, a uint8 distinguishes 255"

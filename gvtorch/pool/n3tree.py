@@ -374,11 +374,9 @@ class N3Tree:
         ValueError if there is no such channel.
         """
         name = check.text(context, "channel", channel) or self.channel_names[0]
-        if name not in self.bricks.channels or self.bricks.channels[name].coarse:
-            raise ValueError(
-                f"{context}: the finest bricks have no channel {check.quoted(name)}; "
-                f"the tree has {', '.join(self.channel_names)}"
-            )
+        check.channel(context, name, self.channel_names)
+        if self.bricks.channels[name].coarse:
+            raise ValueError(f"{context}: only coarse bricks have channel {name!r}")
         return name
 
     def levels(self) -> BrickLevels:

@@ -305,9 +305,8 @@ class BrickPool(_Pool):
 
     def __getitem__(self, channel: str) -> Tensor:
         """Returns the voxels of a channel, (b, z, y, x, c) with borders, to read or to edit."""
-        if check.instance("BrickPool", "channel", channel, str) not in self.bricks:
-            names = ", ".join(self.bricks)
-            raise ValueError(f"BrickPool: unknown channel {channel!r}; it has {names}")
+        check.instance("BrickPool", "channel", channel, str)
+        check.channel("BrickPool", channel, self.bricks, "it")
         return self.bricks[channel]
 
     def __setitem__(self, channel: str, voxels: Tensor) -> None:

@@ -65,6 +65,17 @@ class NodeSummary:
         return round_to(torch.stack((self.low, self.high), -2), dtype)
 
 
+def constant_and_empty(
+    summaries: Iterable[NodeSummary], threshold: float | None
+) -> tuple[Tensor, Tensor]:
+    """Returns (...) bool, given summaries of all channels: whether each is constant; and whether
+    each is empty, which counts even if the other is true.
+    """
+    nodes = [*summaries]
+    constant = torch.stack([summary.is_constant for summary in nodes]).all(0)
+    return constant, torch.stack([summary.is_empty(threshold) for summary in nodes]).all(0)
+
+
 @dataclass(frozen=True)
 class Level:
     """One level of one channel."""
@@ -217,9 +228,7 @@ class TreePlan:
         self.child: list[Tensor] = []
         self.tiles, self.bricks = 1, 0
         for depth, channels in enumerate(zip(*levels.values(), strict=True)):
-            nodes = [level.nodes for level in channels]
-            constant = torch.stack([node.is_constant for node in nodes]).all(0)
-            empty = torch.stack([node.is_empty(threshold) for node in nodes]).all(0)
+            constant, empty = constant_and_empty((level.nodes for level in channels), threshold)
             exists = torch.ones_like(empty)
             if depth > 0:
                 parent = (torch.arange(n, device=empty.device) // branching for n in empty.shape)

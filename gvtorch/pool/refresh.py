@@ -19,7 +19,7 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
 from ..base.volume import movable, to_numpy
 from .downsample import by_node, extend, from_grid, pool_max, pool_min, reduce_windows
 from .pools import BrickPool, NodePool
-from .pyramid import NodeSummary, coarser, node_reduction
+from .pyramid import NodeSummary, coarser, constant_and_empty, node_reduction
 
 _BATCH_BRICKS = 4096  # bricks read or written at a time
 GridPosition = tuple[int, ...]  # voxels or nodes of a level, z y x
@@ -54,7 +54,7 @@ class Span(NamedTuple):
         return Span(first, tuple(min(b, size) for b, size in zip(self.end, shape, strict=True)))
 
     def joined(self, other: Span) -> Span:
-        """Returns the smallest box of both."""
+        """Returns the smallest box that holds both."""
         return Span(tuple(map(min, self.first, other.first)), tuple(map(max, self.end, other.end)))
 
     def slices(self, origin: GridPosition = (0, 0, 0)) -> tuple[slice, ...]:
@@ -192,9 +192,8 @@ class BrickLevels:
         device, pool = node.device, self.nodes
         has_brick = exact & (self.slot_n[node] >= 0)
         learned = any(voxels.requires_grad for voxels in self.bricks.bricks.values())
-        nodes = summaries.values()
-        constant = torch.stack([summary.is_constant for summary in nodes]).all(0).to(device)
-        empty = torch.stack([summary.is_empty(threshold) for summary in nodes]).all(0).to(device)
+        masks = constant_and_empty(summaries.values(), threshold)
+        constant, empty = (mask.to(device) for mask in masks)
         for name, summary in summaries.items():
             for stored, values, mask in (
                 (pool.ranges[name], summary.ranges, exact),

@@ -146,7 +146,7 @@ class _RingSpan:
 
 
 class Chunk:
-    """Bricks `begin` to `end` of a shipment. `with chunk as data:` makes the current stream wait
+    """Bricks `begin` to `end` of `SentBricks`. `with chunk as data:` makes the current stream wait
     for their copy and gives {channel: (k, z, y, x, c)} on the device, valid inside the block.
     """
 
@@ -168,7 +168,7 @@ class Chunk:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Shipment:
+class SentBricks:
     """Bricks that were sent, and those that found no room."""
 
     chunks: Sequence[Chunk]  # the bricks on their way
@@ -194,13 +194,13 @@ class Staging:
         self._device_ring: Tensor | None = None
         self._stream: Any = None
 
-    def send(self, data: Voxels) -> Shipment:
+    def send(self, data: Voxels) -> SentBricks:
         """Sends bricks from the host, as many as there is room for; ValueError if one is larger
         than the ring was made for.
         """
         count = len(next(iter(data.values())))
         if count == 0:
-            return Shipment([], 0, data)
+            return SentBricks([], 0, data)
         widths = [row_bytes(rows) for rows in data.values()]
         cuda = self._device.type == "cuda"
         pinned = {name for name, rows in data.items() if cuda and _is_pinned(rows)}
@@ -225,7 +225,7 @@ class Staging:
             span.chunk = weakref.ref(chunk)
             chunks.append(chunk)
             begin = end
-        return Shipment(chunks, begin, {name: rows[begin:] for name, rows in data.items()})
+        return SentBricks(chunks, begin, {name: rows[begin:] for name, rows in data.items()})
 
     def _copy(
         self, span: _RingSpan, bricks: Voxels, sizes: Sequence[int], pinned: Set[str]

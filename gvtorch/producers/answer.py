@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..base import check
 from ..pool import Channel, TableRows
-from ..pool.pyramid import NodeSummary
+from ..pool.pyramid import NodeSummary, constant_and_empty
 from ..pool.staging import on_device, on_host, upload
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
@@ -47,6 +47,12 @@ def checked_bricks(
     return replace(bricks, data={n: on_device(rows, device) for n, rows in bricks.data.items()})
 
 
+def raise_first(errors: Mapping[int, str]) -> None:
+    """Raises ValueError with the first message, if there are any."""
+    for message in errors.values():
+        raise ValueError(message)
+
+
 def count_kinds(kind: Tensor) -> Tensor:
     """Returns (5,) int64: how many items are EMPTY, CONSTANT, DATA, DATA_MAX_DEPTH and ALIAS."""
     codes = torch.arange(len(Region), device=kind.device)
@@ -59,8 +65,7 @@ def regions_of(
     """Returns the regions of k nodes, given summaries of all channels: EMPTY where no channel has a
     value above the threshold, else CONSTANT where every channel is uniform, else DATA.
     """
-    constant = torch.stack([summary.is_constant for summary in summaries.values()]).all(0)
-    empty = torch.stack([summary.is_empty(threshold) for summary in summaries.values()]).all(0)
+    constant, empty = constant_and_empty(summaries.values(), threshold)
     kind = torch.where(constant, Region.CONSTANT, Region.DATA)
     return Regions(
         kind=torch.where(empty, Region.EMPTY, kind),

@@ -14,7 +14,7 @@ from ..base.volume import to_numpy
 from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
-from .answer import checked_bricks, checked_regions
+from .answer import checked_bricks, checked_regions, raise_first
 from .nodes import Layout, Nodes, grid_of
 from .producer import (
     Bricks,
@@ -202,7 +202,7 @@ class FromChildren(OfProducers):
         """Makes the voxels of nodes of one level; where they are uniform, without making bricks."""
         nodes = Nodes(loc.to(layout.device), layout)
         regions = checked_regions(wait_for(self.producer.classify(nodes)), nodes, self.producer)
-        _raise_first(regions.errors)
+        raise_first(regions.errors)
         kind = regions.kind.cpu()
         self._refuse_alias(kind)
         blocks = _uniform(self, regions.constants, len(loc), layout.brick_size)
@@ -233,7 +233,7 @@ class FromChildren(OfProducers):
     def _finest_voxels(self, nodes: Nodes) -> Blocks:
         """Returns the producer's voxels of finest nodes, without borders."""
         bricks, border = self._producer_bricks(nodes), nodes.layout.border
-        _raise_first(bricks.errors)
+        raise_first(bricks.errors)
         size = nodes.layout.brick_size
         voxels = _uniform(self, bricks.constants, len(nodes), size)
         inner = slice(border, border + size)
@@ -264,8 +264,3 @@ def _uniform(
 def _numpy_dtype(dtype: torch.dtype) -> np.dtype:
     """Returns the NumPy dtype of arrays that hold a channel."""
     return to_numpy(torch.zeros(0, dtype=dtype)).dtype
-
-
-def _raise_first(errors: Mapping[int, str]) -> None:
-    for message in errors.values():
-        raise ValueError(message)

@@ -158,7 +158,7 @@ class FieldProducer(Producer):
             data = self._evaluate(nodes, self.field)
         else:
             order, parts = [], []
-            for rows, field in group_alike(self.field, nodes, self._margin_voxels, _BATCH_BRICKS):
+            for rows, field in group_alike(self.field, nodes, self._margin_voxels):
                 order.append(rows)
                 parts.append(self._evaluate(nodes[rows], field))
             original_order = torch.cat(order).argsort()
@@ -287,12 +287,14 @@ def distances_of(context: str, shape: nn.Module, points: Tensor) -> Tensor:
 
 
 def group_alike(
-    field: nn.Module, nodes: Nodes, margin: float, count: int
+    field: nn.Module, nodes: Nodes, margin: float, *, split: bool = True
 ) -> Iterator[tuple[Tensor, nn.Module]]:
     """Groups nodes by which parts of a field matter in them, up to `margin` voxels beyond the
-    brick's border. Yields indices of at most `count` nodes, and the field reduced to these parts;
-    small groups are joined. Waits for the device.
+    brick's border. Yields the indices of a group, and the field reduced to these parts; small
+    groups are joined, and on the CPU large ones are `split`. Waits for the device.
     """
+    splits = split and nodes.loc.device.type == "cpu"
+    count = _BATCH_BRICKS if splits else max(1, len(nodes))
     if not isinstance(field, Field):
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
         return
@@ -325,7 +327,7 @@ def moving_nodes(
     moves = torch.zeros_like(nodes.depth, dtype=torch.bool)
     for time in times:
         with producer.at_time(time):
-            for rows, reduced in group_alike(field, nodes, margin, max(1, len(nodes))):
+            for rows, reduced in group_alike(field, nodes, margin, split=False):
                 moves[rows] |= bool(clocks_of(reduced))
     return moves
 

@@ -22,7 +22,6 @@ from ..pool import Channel
 from .field import distances_of, group_alike, interval_of, moving_nodes, position_dtype
 from .producer import Layout, Nodes, Producer, Region, Regions, by_depth, check_points
 
-_BATCH_BRICKS = 64  # made at a time on the CPU, so that intermediate values fit into its caches
 _MAX_CELLS = 1.5  # cells along a voxel; beyond, a voxel's mean is computed without the octave
 _ROUNDING = 1e-4  # most that rounding may add to a sum of octaves, in units of the amplitude
 
@@ -111,12 +110,12 @@ class Hypertexture(EvaluationCounter, Producer):
         if box is None:
             shape_box = shape.box()
             if shape_box is None or not bool(shape_box.isfinite().all()):
-                reason = "box must be given: the shape does not tell where it ends"
-                raise ValueError(f"{context}: {reason}")
+                raise ValueError(
+                    f"{context}: box must be given: the shape does not say where it ends"
+                )
             box = [(shape_box[0] - max_offset).tolist(), (shape_box[1] + max_offset).tolist()]
         extent = extent_in(context, extent, box)
-        if not check.instance(context, "dtype", dtype, torch.dtype).is_floating_point:
-            raise ValueError(f"{context}: dtype must be one of floats, got {dtype}")
+        check.float_dtype(context, dtype)
         channels = {"density": Channel(dtype)}
         if distances:
             channels["distance"] = Channel(dtype)
@@ -215,8 +214,7 @@ class Hypertexture(EvaluationCounter, Producer):
             for name, channel in self.channels.items()
         }
         for depth, level_rows in by_depth(nodes.loc):
-            count = _BATCH_BRICKS if device.type == "cpu" else len(level_rows)
-            for rows, reduced in group_alike(self.shape, nodes[level_rows], 0, count):
+            for rows, reduced in group_alike(self.shape, nodes[level_rows], 0):
                 channels = self._evaluate(nodes[level_rows[rows]], self.level_of(depth), reduced)
                 for name, values in channels.items():
                     data[name][level_rows[rows]] = values.to(data[name].dtype)

@@ -60,14 +60,10 @@ class JoinedProducer(OfProducers):
                 raise ValueError(f"{context}: {name!r} needs its parents' bricks")
             ((channel_name, channel),) = producer.channels.items()
             channels[name] = channel
-            ranges |= (
-                {name: producer.value_range[channel_name]}
-                if channel_name in producer.value_range
-                else {}
-            )
-            labels |= (
-                {name: producer.labels[channel_name]} if channel_name in producer.labels else {}
-            )
+            if channel_name in producer.value_range:
+                ranges[name] = producer.value_range[channel_name]
+            if channel_name in producer.labels:
+                labels[name] = producer.labels[channel_name]
         first = next(iter(producers.values()))
         for name, producer in producers.items():
             pairs = zip(grid_of(producer).items(), grid_of(first).values(), strict=True)
@@ -116,7 +112,8 @@ class JoinedProducer(OfProducers):
             constants[name] = (
                 answer.constants.get(channel_name, zero).view(len(kind), -1).to(channel.dtype)
             )
-            ranges |= {name: answer.ranges[channel_name]} if channel_name in answer.ranges else {}
+            if channel_name in answer.ranges:
+                ranges[name] = answer.ranges[channel_name]
         return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(regions))
 
     def _bricks(self, nodes: Nodes, answers: Mapping[str, Any]) -> Bricks:
@@ -125,9 +122,8 @@ class JoinedProducer(OfProducers):
             answer = bricks[name] = producer.as_bricks(answers[name])
             (channel_name,) = producer.channels
             data[name] = answer.data[channel_name]
-            constants |= (
-                {name: answer.constants[channel_name]} if channel_name in answer.constants else {}
-            )
+            if channel_name in answer.constants:
+                constants[name] = answer.constants[channel_name]
         if all(answer.kind is None for answer in bricks.values()):
             return Bricks(data=data, errors=_errors(bricks))
         kind = self._kinds(nodes, [answer.kind for answer in bricks.values()])

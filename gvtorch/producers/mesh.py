@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from ..io.mesh_file import read_mesh
-from ..meshes.holes import solid_when_filled, warning_of_holes
+from ..meshes.holes import warn_of_holes
 from ..meshes.mesh import Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer
 from ..pool import Channel
@@ -58,11 +57,8 @@ class MeshProducer(Producer):
         check.instance("MeshProducer", "mesh", mesh, Mesh, str, Path)
         mesh = mesh if isinstance(mesh, Mesh) else read_mesh(mesh)
         check.known_options("MeshProducer", settings, GridSettings)
-        solid = settings.get("solid", "auto")
-        if solid == "auto" and (warning := warning_of_holes(mesh)):
-            warnings.warn(warning, stacklevel=2)
+        warn_of_holes(mesh, settings.get("solid", "auto"), stacklevel=2)
         grid = Voxelizer(mesh, channels=channels, **settings)
-        self._settings: GridSettings = {**settings, "solid": solid_when_filled(solid)}
         ranges = {"coverage": (0.0, 255.0), "distance": (-grid.band, grid.band)}
         super().__init__(
             grid.extent,
@@ -78,8 +74,10 @@ class MeshProducer(Producer):
     def prepare(self, layout: Layout) -> None:
         """Moves the triangles to the layout's device."""
         if layout.device != self.voxelizer.device:
-            options: dict[str, Any] = {"channels": self.voxelizer.channels, "device": layout.device}
-            self.voxelizer = Voxelizer(self.voxelizer.mesh, **options, **self._settings)
+            grid, device = self.voxelizer, layout.device
+            self.voxelizer = Voxelizer(
+                grid.mesh, channels=grid.channels, device=device, **grid.settings
+            )
 
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY outside (CONSTANT if there are distances) and CONSTANT inside, where no

@@ -71,8 +71,7 @@ class PointProducer(Producer):
                 box, or a number is out of its range.
         """
         context = type(self).__name__
-        if not check.instance(context, "dtype", dtype, torch.dtype).is_floating_point:
-            raise ValueError(f"{context}: dtype must be one of floats, got {dtype}")
+        check.float_dtype(context, dtype)
         if isinstance(positions, (str, Path)):
             positions = SortedPoints.open(positions)
         if isinstance(positions, (Points, SortedPoints)) and not (values is radius is None):

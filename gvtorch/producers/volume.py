@@ -100,7 +100,8 @@ class VolumeProducer(Producer):
             name = str(self._filtered.other)
             sizes = (layout.branching, layout.depth, layout.device, self.channels[name].width)
             self.made_of[name] = self._filtered.made_of
-            values[name] = [*self._filtered.levels(first, *sizes)][::-1]
+            if colors := [*self._filtered.levels(first, *sizes)]:  # none in a tree of one brick
+                values[name] = colors[::-1]
         summaries = {
             name: torch.cat([*map(_node_rows, channel_levels)])
             for name, channel_levels in by_channel.items()
@@ -108,8 +109,7 @@ class VolumeProducer(Producer):
         self._grids = _grid_offsets([level.grid for level in levels])
         if self._hold == "bricks":
             for name, channel_values in values.items():
-                if channel_values:  # a tree of one brick has no coarse ones
-                    self._tables[name] = BrickTable(_all_bricks(channel_values, levels, layout))
+                self._tables[name] = BrickTable(_all_bricks(channel_values, levels, layout))
         if self._hold != "mapped":
             self._values, self._nodes = values, summaries
             return
@@ -119,9 +119,8 @@ class VolumeProducer(Producer):
         self._nodes = {name: mapped(rows, device) for name, rows in summaries.items()}
         while values:  # one by one, and freed, since each is copied
             name, channel_values = values.popitem()
-            if channel_values:  # a tree of one brick has no coarse ones
-                rows = [movable(level).flatten(0, 2) for level in channel_values]
-                self._voxels[name] = mapped(torch.cat(rows), device)
+            rows = [movable(level).flatten(0, 2) for level in channel_values]
+            self._voxels[name] = mapped(torch.cat(rows), device)
 
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY where no finest voxel in reach is above the threshold, else CONSTANT where
@@ -171,8 +170,7 @@ class VolumeProducer(Producer):
         """
         layout, loc = nodes.layout, nodes.loc.to(self._sizes.device)
         first, *sizes = self._sizes[loc[:, 3], :, None, None, None].unbind(1)
-        offsets = torch.arange(layout.side, device=loc.device) - layout.border
-        indices = []
+        offsets, indices = layout.reach.to(loc.device), []
         for axis, (node, size) in enumerate(zip(loc[:, :3].flip(1).unbind(1), sizes, strict=True)):
             axis_offsets = offsets.view([-1 if other == axis else 1 for other in range(3)])
             coordinate = node[:, None, None, None] * layout.brick_size + axis_offsets

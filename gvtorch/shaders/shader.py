@@ -206,13 +206,9 @@ class Shader(Checked):
         """
         channels = tree.bricks.channels
         for name in self.channels:
-            if name not in channels:
-                channel_names = ", ".join(tree.channel_names)
-                raise ValueError(
-                    f"{context}: unknown channel {name!r}; the tree has {channel_names}"
-                )
-            if channels[name].coarse and not (self.reads_coarse and name == self.other):
-                raise ValueError(f"{context}: only coarse bricks have channel {name!r}")
+            check.channel(context, name, channels)
+            if not (self.reads_coarse and name == self.other):
+                tree.fine_channel(context, name)
         if self.kind is None:
             return None
         if self.normals is not None and channels[self.normals].width != 3:

@@ -162,14 +162,10 @@ class Tracer:
 
 def _checked_channel(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
     """Returns the channel that the shader colours; raises ValueError if it does not fit."""
-    first_channel, channels = tree.channel_names[0], tree.bricks.channels
-    channel = check.text("render", "channel", shader.channel) or options.channel or first_channel
-    if channel not in channels:
-        names = ", ".join(tree.channel_names)
-        raise ValueError(f"render: unknown channel {check.quoted(channel)}; the tree has {names}")
-    if channels[channel].coarse:
-        raise ValueError(f"render: only coarse bricks have channel {channel!r}")
-    other_channel = channels.get(str(shader.other))
+    shader_channel = check.text("render", "channel", shader.channel)
+    channel = tree.fine_channel("render", shader_channel or options.channel)
+    first_channel = tree.channel_names[0]
+    other_channel = tree.bricks.channels.get(str(shader.other))
     if other_channel is not None and other_channel.coarse and channel != first_channel:
         raise ValueError(
             f"render: channel {shader.other!r} was made of {first_channel!r}, not of {channel!r}"

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from ..base import check
 from ..base.records import Hits, Rays
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
@@ -47,11 +48,7 @@ def tree_traces(
         check_shader(context, f"shader of tree {name!r}", shader)
         channel = options.channel or next(iter(channels))
         for needed in (channel, *shader.channels):
-            if needed not in channels:
-                channel_list = ", ".join(channels)
-                raise ValueError(
-                    f"{context}: tree {name!r} has no channel {needed!r}; it has {channel_list}"
-                )
+            check.channel(context, needed, channels, f"tree {name!r}")
         tree_options = replace(options, channel=channel, pose=poses[name])
         tracer = Tracer(tree, shader, tree_options, by_level=by_level, frame_1=frame_1)
         traces.append(TreeTrace.of(tracer, tree_options, box))

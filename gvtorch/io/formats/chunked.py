@@ -139,9 +139,8 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                     )
                     steps[axis], is_even = even_steps(values)
                     units[axis] = str(_read_attributes(str(sibling)).get("units", "")) or None
-                    dropped += (
-                        [] if is_even else [f"that coordinates along {name} are not evenly spaced"]
-                    )
+                    if not is_even:
+                        dropped.append(f"that coordinates along {name} are not evenly spaced")
     axis_order = axis_order or ask_axes(path, shape, axes)
     placement, info_fields = axes_placement(axis_order, shape, steps, units)
     quantity = attributes.get("units")

@@ -5,7 +5,6 @@ Source: ZISRAW (CZI) metadata of pylibCZIrw's documentation: Scaling, Channels, 
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
@@ -15,7 +14,7 @@ import numpy as np
 from ...base.digits import finite_number
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels, from_hex
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import FileMetadata, Index, VolumeSource
+from ..source import FileMetadata, Index, VolumeSource, read_planes
 from .format import Format, choose
 
 _DTYPES = {
@@ -42,22 +41,18 @@ class CziSource(VolumeSource):
         rows, columns = index[3], index[4]
         size = (columns.stop - columns.start, rows.stop - rows.start)
         roi = (self.corner[0] + columns.start, self.corner[1] + rows.start, *size)
-        out = np.empty([s.stop - s.start for s in index], self.stored)
-        spans = [range(s.start, s.stop) for s in index[:3]]
         with czi.open_czi(self.path) as file:
-            for plane_index in itertools.product(*spans):
+
+            def read(position: tuple[int, ...]) -> np.ndarray:
                 plane = {
-                    axis: position + first
-                    for position, (axis, first) in zip(plane_index, self.starts, strict=True)
+                    axis: first + n for n, (axis, first) in zip(position, self.starts, strict=True)
                 }
                 pixels = file.read(roi=roi, plane=plane, scene=self.scene)
                 if pixels.shape[2] == 3:
                     pixels = pixels[..., ::-1]  # blue comes first
-                out_index = tuple(
-                    p - span.start for p, span in zip(plane_index, spans, strict=True)
-                )
-                out[out_index] = pixels[..., index[5]]
-        return out
+                return pixels[..., index[5]]
+
+            return read_planes(index, 3, self.stored, read)
 
 
 @Format("CZI", ".czi", options=("key",), library="pylibCZIrw", extra="microscopes")

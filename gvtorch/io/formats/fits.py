@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..packed import is_packed_fits
-from ..source import ArraySource, Index, VolumeSource
+from ..source import ArraySource, Index, VolumeSource, read_planes
 from .format import Format
 
 
@@ -28,10 +28,11 @@ class FitsSource(VolumeSource):
             cube = _first_cube(self.path, hdus)
             if self.whole or self.covers(index):
                 return np.asarray(cube.data)[index]
-            leading = (0,) * (len(index) - 3)
-            planes = range(*index[-3].indices(self.shape[-3]))
-            stack = np.stack([np.asarray(cube.section[(*leading, z)])[index[-2:]] for z in planes])
-        return stack.reshape((1,) * len(leading) + stack.shape)
+
+            def read(position: tuple[int, ...]) -> np.ndarray:
+                return np.asarray(cube.section[position])[index[-2:]]
+
+            return read_planes(index, len(index) - 2, self.stored, read)
 
 
 @Format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")

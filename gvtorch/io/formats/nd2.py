@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
 from ...base.units import spacing_of
-from ..source import FileMetadata, Index, VolumeSource
+from ..source import FileMetadata, Index, VolumeSource, read_planes
 from .format import Format, choose
 
 
@@ -24,21 +23,19 @@ class Nd2Source(VolumeSource):
     def read_stored(self, index: Index) -> np.ndarray:
         import nd2
 
-        times, slices, *plane_index = index
-        out = np.empty([s.stop - s.start for s in index], self.stored)
         with nd2.ND2File(self.path) as file:
             frame_numbers = {
                 (loop_index.get("T", 0), loop_index.get("Z", 0)): number
                 for number, loop_index in enumerate(file.loop_indices)
                 if loop_index.get("P", 0) == self.position
             }
-            for t, z in itertools.product(
-                range(times.start, times.stop), range(slices.start, slices.stop)
-            ):
+
+            def read(position: tuple[int, ...]) -> np.ndarray:
+                t, z = position
                 frame = np.asarray(file.read_frame(frame_numbers[t, z] if frame_numbers else 0))
-                part = frame.reshape(self.shape[2:])[tuple(plane_index)]
-                out[t - times.start, z - slices.start] = part
-        return out
+                return frame.reshape(self.shape[2:])[index[2:]]
+
+            return read_planes(index, 2, self.stored, read)
 
 
 @Format("ND2", ".nd2", options=("key",), library="nd2", extra="microscopes")

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...base import boxes
 from ...base.image_info import ImageInfo, color_channels
-from ..source import ArraySource, FileMetadata, Index, VolumeSource
+from ..source import ArraySource, FileMetadata, Index, VolumeSource, read_planes
 from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff
 from .format import Format, choose
 
@@ -35,17 +35,14 @@ class TiffSource(VolumeSource):
                 check_pictures(series.pages)
                 return series.asarray()[index]
             leading = len(self.shape) - len(series.keyframe.shape)
-            data = np.empty([s.stop - s.start for s in index], self.stored)
-            spans = [range(s.start, s.stop) for s in index[:leading]]
-            for page_index in itertools.product(*spans):
-                page_number = (
-                    int(np.ravel_multi_index(page_index, self.shape[:leading])) if leading else 0
-                )
-                position = tuple(p - span.start for p, span in zip(page_index, spans, strict=True))
-                if (page := series.pages[page_number]) is None:
-                    raise ValueError(f"{self.path}: page {page_number} is missing")
-                data[position] = read_page(page, series.keyframe, index[leading:])
-        return data
+
+            def read(position: tuple[int, ...]) -> np.ndarray:
+                number = int(np.ravel_multi_index(position, self.shape[:leading])) if leading else 0
+                if (page := series.pages[number]) is None:
+                    raise ValueError(f"{self.path}: page {number} is missing")
+                return read_page(page, series.keyframe, index[leading:])
+
+            return read_planes(index, leading, self.stored, read)
 
 
 def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:

@@ -93,7 +93,7 @@ def convert_channels(
     total, done = sum(source.nbytes for source in sources.values()), 0
     for name, source in sources.items():
         if not unfinished.is_finished(target / name):
-            is_half_written = (target / name / WORK / "manifest.json").exists()
+            is_half_written = unfinished.is_half_written(target / name)
             if not is_half_written:
                 shutil.rmtree(target / name, ignore_errors=True)
             channel_progress = _channel_progress(progress, done, source.nbytes, total)

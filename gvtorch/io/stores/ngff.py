@@ -19,7 +19,17 @@ from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import metres
 from ..http import Endless
 from ..remote import is_file_url
-from .store_layout import MAX_JSON_BYTES, WORK, Deadline, StoreLayout, child, is_number, read_key
+from .store_layout import (
+    JOURNAL,
+    MANIFEST,
+    MAX_JSON_BYTES,
+    WORK,
+    Deadline,
+    StoreLayout,
+    child,
+    is_number,
+    read_key,
+)
 
 CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
 _MAX_LEVELS = 64
@@ -160,10 +170,10 @@ def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     if isinstance(root, dict) and not Path(root["path"]).exists():
         return FileNotFoundError(f"store not found: {location}")
     work_folder = child(root, WORK)
-    manifest = read_json(location, work_folder, "manifest.json", deadline)
+    manifest = read_json(location, work_folder, MANIFEST, deadline)
     if manifest is None:
         return ValueError(f"{location}: not a store: has neither zarr.json nor .zattrs")
-    done = (read_key(location, work_folder, "journal.jsonl", deadline) or b"").count(b"\n")
+    done = (read_key(location, work_folder, JOURNAL, deadline) or b"").count(b"\n")
     return ValueError(
         f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
         f"gvtorch convert {shlex.join((str(manifest.get('source', 'SOURCE')), location))} --resume "

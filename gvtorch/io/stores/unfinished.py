@@ -22,10 +22,10 @@ from ...base.volume import Volume, movable
 from ...base.whole_file import durable_file, name_in_errors, rename
 from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
 from .ngff import image_metadata, read_json_file
-from .store_layout import GROUPS, WORK, StoreLayout
+from .store_layout import GROUPS, JOURNAL, MANIFEST, WORK, StoreLayout
 
 Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
-_JOURNAL, _MANIFEST, _LOCK = "journal.jsonl", "manifest.json", "lock"
+_LOCK = "lock"
 
 
 class TaskResult(NamedTuple):
@@ -48,7 +48,7 @@ class UnfinishedStore:
     def record(self, done: Mapping[Task, TaskResult]) -> None:
         """Adds finished tasks to the journal; they are on disk when this returns."""
         self.done |= done
-        with name_in_errors(self.target / WORK / _JOURNAL):
+        with name_in_errors(self.target / WORK / JOURNAL):
             _write_journal_lines(self.journal, done)
 
     def finish(self, layout: StoreLayout, info: ImageInfo, settings: Mapping[str, Any]) -> None:
@@ -73,7 +73,12 @@ def is_finished(target: Path) -> bool:
     return (target / "zarr.json").exists()
 
 
-def is_begun(target: Path, *, resume: bool, manifest: str = _MANIFEST) -> bool:
+def is_half_written(target: Path, manifest: str = MANIFEST) -> bool:
+    """Returns whether a store was begun here and not finished."""
+    return (target / WORK / manifest).exists()
+
+
+def is_begun(target: Path, *, resume: bool, manifest: str = MANIFEST) -> bool:
     """Returns whether there is a half-written store, with a file `manifest`, to continue.
 
     Raises:
@@ -84,7 +89,7 @@ def is_begun(target: Path, *, resume: bool, manifest: str = _MANIFEST) -> bool:
     if is_finished(target):
         raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
     folder = target / WORK
-    if (folder / manifest).exists():
+    if is_half_written(target, manifest):
         if not resume:
             raise FileExistsError(
                 f"{target}: half-written; continue with --resume (resume=True), or remove it"
@@ -116,14 +121,14 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
         done = {}
         if begun:
             _check_settings(target, settings)
-            done = _read_journal(folder / _JOURNAL)
+            done = _read_journal(folder / JOURNAL)
         else:
-            write_json(folder / _MANIFEST, settings)
-        draft = folder / f".{_JOURNAL}.draft"
+            write_json(folder / MANIFEST, settings)
+        draft = folder / f".{JOURNAL}.draft"
         with draft.open("w", encoding="utf-8") as journal:
             with name_in_errors(draft):
                 _write_journal_lines(journal, done)
-            rename(draft, folder / _JOURNAL)
+            rename(draft, folder / JOURNAL)
             yield UnfinishedStore(target, journal, done)
 
 
@@ -169,7 +174,7 @@ def locked(file: Path, message: str) -> Iterator[IO[str]]:
 
 
 def _check_settings(target: Path, settings: dict[str, Any]) -> None:
-    manifest = target / WORK / _MANIFEST
+    manifest = target / WORK / MANIFEST
     previous = read_json_file(manifest)
     current = as_json(settings)
     if previous.get("fingerprint") != current["fingerprint"]:
@@ -188,7 +193,7 @@ def _check_settings(target: Path, settings: dict[str, Any]) -> None:
 
 def count_done(target: Path) -> int:
     """Returns the number of finished tasks in a target's journal."""
-    journal = target / WORK / _JOURNAL
+    journal = target / WORK / JOURNAL
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
