@@ -337,6 +337,51 @@ def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
             gv.read_volume(file, key="a", axes="zyx")
 
 
+@pytest.mark.parametrize("kind", ["behind another", "numbered files", "numbered data sets"])
+def test_hdf5_virtual_data_sets_do_not_lead_elsewhere(tmp_path, kind):
+    """By way of another of the same file, or by a pattern for names, %b, that HDF5 expands."""
+    h5py = pytest.importorskip("h5py")
+    data = np.arange(512, dtype=np.uint8).reshape(8, 8, 8)
+    (tmp_path / "in").mkdir()
+    with h5py.File(tmp_path / "far0.h5", "w") as file:
+        file["b0"] = data
+    with h5py.File(tmp_path / "in" / "a.h5", "w") as root:
+        layout = h5py.VirtualLayout(data.shape, "u1")
+        layout[:] = h5py.VirtualSource("../far0.h5", "b0", data.shape)
+        root.create_virtual_dataset("b0", layout)
+        file_name = b"../far%b.h5" if kind == "numbered files" else b"."
+        name = {"behind another": b"b0", "numbered files": b"b0"}.get(kind, b"b%b")
+        space = h5py.h5s.create_simple(data.shape, (h5py.h5s.UNLIMITED, 8, 8))
+        count = (1 if name == b"b0" and file_name == b"." else h5py.h5s.UNLIMITED, 1, 1)
+        space.select_hyperslab((0, 0, 0), count, data.shape, data.shape)
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_virtual(space, file_name, name, h5py.h5s.create_simple(data.shape))
+        h5py.h5d.create(root.id, b"a", h5py.h5t.STD_U8LE, space, settings)
+    with pytest.raises(ValueError, match=r"is in another folder|names with % are not read"):
+        gv.read_volume(tmp_path / "in" / "a.h5", key="a", axes="zyx")
+
+
+def test_hdf5_reads_coordinates_of_files_beside_it(tmp_path):
+    """Those of a dimension scale, which may be a virtual data set as well."""
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "in").mkdir()
+    for name in ("in/other.h5", "far.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["b"] = np.arange(8.0) * 3
+    file = tmp_path / "in" / "a.h5"
+    for name in ("other.h5", "../far.h5"):
+        with h5py.File(file, "w") as root:
+            root["a"] = np.zeros((8, 8, 8), np.uint8)
+            layout = h5py.VirtualLayout((8,), "f8")
+            layout[:] = h5py.VirtualSource(name, "b", (8,))
+            root.create_virtual_dataset("x", layout).make_scale("x")
+            root["a"].dims[2].attach_scale(root["x"])
+        if name == "other.h5":
+            assert gv.read_volume(file, key="a", axes="zyx").spacing[0] == 3
+    with pytest.raises(ValueError, match=r"a\.h5: names \S*far\.h5, which is in another folder"):
+        gv.read_volume(file, key="a", axes="zyx")
+
+
 def picture_in_tiff(
     folder: Path, packed: bytes, number: int, *, color: bool = False, tiled: bool = True
 ) -> Path:

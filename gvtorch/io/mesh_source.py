@@ -44,8 +44,6 @@ class MeshSource(VolumeSource):
     settings: tuple[tuple[str, Any], ...]  # resolution, band and thickness
     solid: SolidParts
     identity: tuple[Any, ...]  # of mesh and settings: equal while these are unchanged
-    command_options: tuple[str, ...] = ()  # options of the command line that makes the store
-    one_of_several: bool = False  # whether its store is one of several, one per channel
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
     file: str = ""  # holds the mesh, if that is not in memory
 
@@ -81,8 +79,6 @@ class MeshSource(VolumeSource):
         identity.insert(0, checksum(v for name, v in _mesh_arrays(mesh).items() if name != "name"))
         settings: dict[str, Any] = {"resolution": resolution, "band": band, "thickness": thickness}
         voxelizer = Voxelizer(mesh, channels=names, **settings, solid=solid)
-        setting_options = [word for key, n in settings.items() for word in (f"--{key}", f"{n:g}")]
-        options = ("--channels", ",".join(names), *setting_options, "--solid", solid)
         sources = {}
         for channel in names:
             dtype, width = CHANNELS[channel]
@@ -100,10 +96,6 @@ class MeshSource(VolumeSource):
                 settings=tuple(settings.items()),
                 solid=solid,
                 identity=tuple(identity),
-                command_options=options
-                if texture is None
-                else (*options, "--texture", str(texture)),
-                one_of_several=len(names) > 1,
                 mesh=voxelizer.mesh,
             )
         return sources
@@ -119,11 +111,6 @@ class MeshSource(VolumeSource):
     def fingerprint(self) -> list[Any]:
         """Returns values that identify the mesh, the channel and the settings."""
         return [*self.identity, self.channel, *(n for _, n in self.settings), self.solid]
-
-    def command(self, store: str) -> tuple[str, ...]:
-        """Returns the words of the `gvtorch voxelize` command that makes a store of it."""
-        store = str(Path(store).parent) if self.one_of_several else store
-        return ("gvtorch", "voxelize", self.path, "-o", store, *self.command_options)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
         low, high = [span.start for span in index[:3]], [span.stop for span in index[:3]]

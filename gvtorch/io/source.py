@@ -128,10 +128,6 @@ class VolumeSource(ABC):
         """Returns values that change with the content; None if the files at `path` identify it."""
         return None
 
-    def command(self, store: str) -> tuple[str, ...]:
-        """Returns the words of the command line that makes a store of it."""
-        return ("gvtorch", "convert", self.path, store)
-
     def covers(self, index: Index) -> bool:
         """Returns whether an index covers the whole array."""
         return all(s.stop - s.start == n for s, n in zip(index, self.shape, strict=True))

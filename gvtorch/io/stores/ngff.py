@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +18,16 @@ from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import metres
 from ..http import Endless
 from ..remote import is_file_url
-from .store_layout import MAX_JSON_BYTES, WORK, Deadline, StoreLayout, child, is_number, read_key
+from .store_layout import (
+    MAX_JSON_BYTES,
+    RESUME_ADVICE,
+    WORK,
+    Deadline,
+    StoreLayout,
+    child,
+    is_number,
+    read_key,
+)
 
 CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
 _MAX_LEVELS = 64
@@ -166,8 +174,7 @@ def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     done = (read_key(location, work_folder, "journal.jsonl", deadline) or b"").count(b"\n")
     return ValueError(
         f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
-        f"gvtorch convert {shlex.join((str(manifest.get('source', 'SOURCE')), location))} --resume "
-        "goes on"
+        f"{RESUME_ADVICE}"
     )
 
 
