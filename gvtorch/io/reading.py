@@ -23,7 +23,7 @@ from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, split_url
-from .resources import amount, memory_free
+from .resources import check_memory
 from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
 from .stores.ngff import is_zarr
 from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES, StoreError
@@ -217,11 +217,7 @@ def read_time_points(source: VolumeSource, first: int = 0, times: int = 1) -> np
     # A file that is mapped is not copied.
     is_mapped = isinstance(source, ArraySource) and not source.whole and same_dtype
     if not isinstance(source, MemorySource) and not is_mapped:
-        free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
-        if needed > free:
-            raise ValueError(
-                f"{source.path}: takes {amount(needed)} of memory, {amount(free)} are free"
-            )
+        check_memory(source.path, source.peak_bytes + (times - 1) * source.nbytes)
     kind = "an array" if is_array else find_format(source.path, raw=True).name
     with convert_errors(
         ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError

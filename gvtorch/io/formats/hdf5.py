@@ -251,9 +251,7 @@ def _axes(
             and scale.shape == shape[axis : axis + 1]
             and scale.dtype.kind in "iuf"
         ):
-            steps[axis], is_even = even_steps(scale[()])
-            if not is_even:
-                dropped.append(f"that coordinates along {names[axis]} are not evenly spaced")
+            steps[axis] = even_steps(names[axis], scale[()], dropped)
     tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]
