@@ -22,7 +22,7 @@ from ..base.volume import Volume, check_extent
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
-from .remote import fetch, is_file_url, split_url
+from .remote import fetch, is_file_url
 from .resources import check_memory
 from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
 from .stores.ngff import is_zarr
@@ -175,11 +175,9 @@ def _find_opener(
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
         known_options: tuple[str, ...] = ("axes",)
     else:
-        text, key = split_url(str(path))
+        text, key = split_path(str(path))
         if is_file_url(text):
             text = str(fetch(text))
-        elif key is None:
-            text, key = split_path(text)
         if key is not None:
             arguments["key"] = key.strip("/") if is_zarr(text) else key
         if not is_zarr(text) and not Path(text).exists():
