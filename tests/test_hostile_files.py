@@ -7,7 +7,6 @@ from __future__ import annotations
 import base64
 import bz2
 import gzip
-import importlib
 import json
 import os
 import resource
@@ -21,7 +20,7 @@ import pytest
 from helpers import hostile
 
 import gvtorch as gv
-from gvtorch.io import budget, reading
+from gvtorch.io import budget, mesh_file, resources
 from gvtorch.io.picture_size import picture_size
 
 MEMORY = 1500 << 20  # bytes of address space beyond what the libraries use
@@ -83,7 +82,7 @@ def test_files_that_eat_a_machine_are_refused(tmp_path):
 def test_what_is_larger_than_memory_is_told_before(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", np.zeros((100, 100, 100), np.uint8))
     np.save(tmp_path / "b.npy", np.zeros((100, 100, 100), np.uint8))
-    monkeypatch.setattr(reading, "memory_free", lambda: 10**6)
+    monkeypatch.setattr(resources, "memory_free", lambda: 10**6)
     with pytest.raises(ValueError, match=r"a\.npz: takes 2\.0 MB of memory, 1\.0 MB are free"):
         gv.read_volume(tmp_path / "a.npz")
     assert gv.read_volume(tmp_path / "b.npy").extent == (100, 100, 100)  # it stays in its file
@@ -127,9 +126,9 @@ def test_meshes_and_points_unpack_to_no_more_than_free_memory(tmp_path, monkeypa
         file, read = tmp_path / "a.npz", gv.read_points
         np.savez_compressed(file, position=np.zeros((10**5, 3), np.float32))
     assert file.stat().st_size < 10_000
-    module = importlib.import_module(f"gvtorch.io.{kind.rstrip('s')}_file")
-    monkeypatch.setattr(module, "memory_free", lambda: 10**6)
-    with pytest.raises(ValueError, match=r"unpacks to .*memory") as caught:
+    for module in (resources, mesh_file):
+        monkeypatch.setattr(module, "memory_free", lambda: 10**6)
+    with pytest.raises(ValueError, match=r"(unpacks to|takes) .*memory") as caught:
         read(file)
     assert "\n" not in str(caught.value)
 
@@ -275,12 +274,11 @@ def test_textures_that_eat_a_machine_are_refused(tmp_path, kind):
 
 def test_a_mesh_reads_no_more_than_memory_takes(tmp_path, monkeypatch):
     pytest.importorskip("trimesh")
-    module = importlib.import_module("gvtorch.io.mesh_file")
     with (tmp_path / "a.bin").open("wb") as file:
         file.truncate(10**7)
     (tmp_path / "a.gltf").write_text(json.dumps(gltf(buffers=[{"uri": "a.bin"}])))
     (tmp_path / "a.stl").write_bytes(bytes(10**7))
-    monkeypatch.setattr(module, "memory_free", lambda: 10**7)
+    monkeypatch.setattr(resources, "memory_free", lambda: 10**7)
     with pytest.raises(ValueError, match=r"names a\.bin: takes 40\.0 MB of memory, 10\.0 MB are"):
         gv.read_mesh(tmp_path / "a.gltf")
     with pytest.raises(ValueError, match=r"a\.stl: takes 40\.0 MB of memory, 10\.0 MB are free"):
@@ -335,6 +333,51 @@ def test_hdf5_reads_regular_files_beside_it(tmp_path, kind):
             write(file, "other.h5")
         with pytest.raises(ValueError, match=r"is in another folder|is not a regular file"):
             gv.read_volume(file, key="a", axes="zyx")
+
+
+@pytest.mark.parametrize("kind", ["behind another", "numbered files", "numbered data sets"])
+def test_hdf5_virtual_data_sets_do_not_lead_elsewhere(tmp_path, kind):
+    """By way of another of the same file, or by a pattern for names, %b, that HDF5 expands."""
+    h5py = pytest.importorskip("h5py")
+    data = np.arange(512, dtype=np.uint8).reshape(8, 8, 8)
+    (tmp_path / "in").mkdir()
+    with h5py.File(tmp_path / "far0.h5", "w") as file:
+        file["b0"] = data
+    with h5py.File(tmp_path / "in" / "a.h5", "w") as root:
+        layout = h5py.VirtualLayout(data.shape, "u1")
+        layout[:] = h5py.VirtualSource("../far0.h5", "b0", data.shape)
+        root.create_virtual_dataset("b0", layout)
+        file_name = b"../far%b.h5" if kind == "numbered files" else b"."
+        name = {"behind another": b"b0", "numbered files": b"b0"}.get(kind, b"b%b")
+        space = h5py.h5s.create_simple(data.shape, (h5py.h5s.UNLIMITED, 8, 8))
+        count = (1 if name == b"b0" and file_name == b"." else h5py.h5s.UNLIMITED, 1, 1)
+        space.select_hyperslab((0, 0, 0), count, data.shape, data.shape)
+        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        settings.set_virtual(space, file_name, name, h5py.h5s.create_simple(data.shape))
+        h5py.h5d.create(root.id, b"a", h5py.h5t.STD_U8LE, space, settings)
+    with pytest.raises(ValueError, match=r"is in another folder|names with % are not read"):
+        gv.read_volume(tmp_path / "in" / "a.h5", key="a", axes="zyx")
+
+
+def test_hdf5_reads_coordinates_of_files_beside_it(tmp_path):
+    """Those of a dimension scale, which may be a virtual data set as well."""
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "in").mkdir()
+    for name in ("in/other.h5", "far.h5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["b"] = np.arange(8.0) * 3
+    file = tmp_path / "in" / "a.h5"
+    for name in ("other.h5", "../far.h5"):
+        with h5py.File(file, "w") as root:
+            root["a"] = np.zeros((8, 8, 8), np.uint8)
+            layout = h5py.VirtualLayout((8,), "f8")
+            layout[:] = h5py.VirtualSource(name, "b", (8,))
+            root.create_virtual_dataset("x", layout).make_scale("x")
+            root["a"].dims[2].attach_scale(root["x"])
+        if name == "other.h5":
+            assert gv.read_volume(file, key="a", axes="zyx").spacing[0] == 3
+    with pytest.raises(ValueError, match=r"a\.h5: names \S*far\.h5, which is in another folder"):
+        gv.read_volume(file, key="a", axes="zyx")
 
 
 def picture_in_tiff(

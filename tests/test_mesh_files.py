@@ -304,7 +304,7 @@ def test_a_broken_off_voxelization_goes_on(tmp_path, torus_file, monkeypatch):
     with stopped_at(monkeypatch, 3):
         run = gvtorch(*command)
     assert run.returncode == 130 and "2 of" in run.stderr
-    assert f"gvtorch voxelize {torus_file} -o {store}" in run.stderr and "--resume" in run.stderr
+    assert "the same command with --resume" in run.stderr
     changed = gvtorch(*command, "--band", 6, "--resume")
     assert changed.returncode == 2 and "not the one that it was begun with" in changed.stderr
     done = gvtorch(*command, "--resume")

@@ -210,8 +210,7 @@ def test_ctrl_c_ends_in_one_line_that_tells_how_to_go_on(tmp_path, workers, dela
     _, err = process.communicate(timeout=120)
     assert process.returncode == 130
     assert err.count("\n") == 1 and "Traceback" not in err
-    assert f"convert '{source}' {target} --resume continues it" in err
-    assert "interrupted, " in err
+    assert "interrupted, " in err and "the same command with --resume" in err
     assert_holds(convert(source, target, resume=True, workers=1), data)
     assert sorted(os.listdir(tmp_path)) == ["a.zarr", "my scan.npy", "script.py"]
     assert not [file for file in Path(target).rglob("*") if "__lock" in file.name]

@@ -214,7 +214,10 @@ def test_light_has_colours_and_the_producer_s_voxels(tmp_path):
 def test_a_broken_off_splat_goes_on(tmp_path, monkeypatch):
     path, store = write_npz(tmp_path / "a.npz"), tmp_path / "a.zarr"
     options = {"extent": 300, "workers": 1}
-    with stopped_at(monkeypatch, 3), pytest.raises(KeyboardInterrupt, match="gvtorch splat"):
+    with (
+        stopped_at(monkeypatch, 3),
+        pytest.raises(KeyboardInterrupt, match="the same command with --resume"),
+    ):
         gv.splat(path, store, **options)
     assert (store / WORK / "points" / "points.json").exists()
     with pytest.raises(ValueError, match="begun with other points or settings"):

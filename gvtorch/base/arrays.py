@@ -219,16 +219,13 @@ def _axis_metadata(
         names = [""] * rank
     steps: list[tuple[float, float] | None] = [None] * rank
     units: list[str | None] = [None] * rank
-    dropped = []
+    dropped: list[str] = []
     coords = getattr(array, "coords", {})
     for axis, name in enumerate(names):
         if name and name in coords:
             coordinate = coords[name]
-            values = np.asarray(coordinate.values)
-            steps[axis], even = even_steps(values)
+            steps[axis] = even_steps(name, coordinate.values, dropped)
             units[axis] = str(coordinate.attrs.get("units", "")) or None
-            if not even:
-                dropped.append(f"that coordinates along {name} are not evenly spaced")
     return names, steps, units, dropped
 
 

@@ -1,16 +1,21 @@
-"""Error messages for users: one printable line, and what to install. Does not import torch."""
+"""Messages for users: errors in one printable line, what to install, and what libraries log. Does
+not import torch.
+"""
 
 from __future__ import annotations
 
 import importlib
+import logging
 import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 # Characters that a terminal obeys, that end a line, or that change the direction of text.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
-
-
 _MAX_CHARACTERS = 1500  # characters in a line
+_COLLECTED = threading.local()  # its `records` are those that `collected_log` collects in a thread
 
 
 def one_line(error: object, limit: int = _MAX_CHARACTERS) -> str:
@@ -45,3 +50,24 @@ def need_library(feature: str, library: str, package: str = "", extra: str = "io
         raise ImportError(
             f"{feature} needs {package or library}: pip install 'gvtorch[{extra}]' ({error})"
         ) from None
+
+
+@contextmanager
+def collected_log(name: str) -> Iterator[list[logging.LogRecord]]:
+    """Collects what the logger `name` receives from this thread, instead of letting it be printed;
+    the list grows during the `with` block.
+    """
+    logging.getLogger(name).addFilter(_collect)  # further calls add nothing
+    _COLLECTED.records = records = list[logging.LogRecord]()
+    try:
+        yield records
+    finally:
+        _COLLECTED.records = None
+
+
+def _collect(record: logging.LogRecord) -> bool:
+    """Returns whether a record may be printed: nobody collects those of this thread."""
+    records: list[logging.LogRecord] | None = getattr(_COLLECTED, "records", None)
+    if records is not None:
+        records.append(record)
+    return records is None

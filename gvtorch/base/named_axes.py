@@ -70,18 +70,21 @@ def ask_axes(path: str, shape: Sequence[int], axes: str | None = None) -> str:
     )
 
 
-def even_steps(coordinates: Any) -> tuple[tuple[float, float] | None, bool]:
-    """Returns step and first of evenly spaced coordinates (None if they are not, or not numbers),
-    and whether they are even; also true for what can't be uneven, such as text.
+def even_steps(name: str, coordinates: Any, dropped: list[str]) -> tuple[float, float] | None:
+    """Returns step and first of the coordinates along an axis; None if they are not numbers, such
+    as text, or not evenly spaced, which is added to `dropped`, the metadata that is not kept.
     """
     values = np.asarray(coordinates)
-    if values.ndim != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
-        return None, values.dtype.kind not in "iuf"
-    if len(values) < 2:
-        return (1.0, float(values[0])) if len(values) else None, True
-    step = (float(values[-1]) - float(values[0])) / (len(values) - 1)
-    even = bool(step and np.abs(np.diff(values.astype(np.float64)) / step - 1).max() < 1e-2)
-    return ((step, float(values[0])) if even else None), even
+    if values.dtype.kind not in "iuf":
+        return None
+    if values.ndim == 1 and np.isfinite(values).all():
+        if len(values) < 2:
+            return (1.0, float(values[0])) if len(values) else None
+        step = (float(values[-1]) - float(values[0])) / (len(values) - 1)
+        if step and np.abs(np.diff(values.astype(np.float64)) / step - 1).max() < 1e-2:
+            return step, float(values[0])
+    dropped.append(f"that coordinates along {name} are not evenly spaced")
+    return None
 
 
 def axes_placement(

@@ -21,7 +21,7 @@ from ..base.image_info import array_from_srgb
 from ..base.messages import need_library, one_line
 from ..meshes.mesh import MOST_FACES, Material, Mesh
 from .polygons import cut_polygons
-from .resources import amount, memory_free
+from .resources import amount, check_memory, memory_free
 from .source import convert_errors
 
 #: Endings that are read, also followed by .gz. Other formats of trimesh need more libraries, or
@@ -117,7 +117,7 @@ def _ending(path: Path) -> tuple[str, bool]:
 def _read_content(path: Path, packed: bool) -> bytes:
     max_bytes = memory_free() // _MEMORY_PER_BYTE
     if not packed:
-        _check_size(str(path), path.stat().st_size)
+        check_memory(str(path), path.stat().st_size * _MEMORY_PER_BYTE)
         return path.read_bytes()
     try:
         with gzip.open(path) as stream:
@@ -129,12 +129,6 @@ def _read_content(path: Path, packed: bool) -> bytes:
             f"{path}: unpacks to more than {amount(max_bytes)}, what free memory can take"
         )
     return content
-
-
-def _check_size(context: str, size: int) -> None:
-    if size * _MEMORY_PER_BYTE > (free := memory_free()):
-        needs, has = amount(size * _MEMORY_PER_BYTE), amount(free)
-        raise ValueError(f"{context}: takes {needs} of memory, {has} are free")
 
 
 def _images(loaded: Any) -> list[Any]:
@@ -235,7 +229,7 @@ class _FolderResolver:
         self.images += file.suffix.lower() not in (".mtl", ".bin")
         self.size += file.stat().st_size
         try:
-            _check_size(f"names {plain_name}", self.size)
+            check_memory(f"names {plain_name}", self.size * _MEMORY_PER_BYTE)
         except ValueError as error:
             self.problem = str(error)
             raise

@@ -43,8 +43,6 @@ class MeshSource(VolumeSource):
     settings: tuple[tuple[str, Any], ...]  # `Voxelizer.settings`
     solid: SolidParts  # as the user chose
     identity: tuple[Any, ...]  # of mesh and settings: equal while these are unchanged
-    command_options: tuple[str, ...] = ()  # options of the command line that makes the store
-    one_of_several: bool = False  # whether its store is one of several, one per channel
     mesh: Mesh | None = dataclasses.field(default=None, repr=False)  # with its holes filled
     file: str = ""  # holds the mesh, if that is not in memory
 
@@ -76,9 +74,6 @@ class MeshSource(VolumeSource):
         warn_of_holes(mesh, solid, stacklevel=3)
         identity.insert(0, checksum(v for name, v in _mesh_arrays(mesh).items() if name != "name"))
         voxelizer = Voxelizer(mesh, channels=names, **settings)
-        numbers = [(name, n) for name, n in voxelizer.settings.items() if name != "solid"]
-        number_options = [word for name, n in numbers for word in (f"--{name}", f"{n:g}")]
-        options = ("--channels", ",".join(names), *number_options, "--solid", solid)
         sources = {}
         for channel in names:
             dtype, width = CHANNELS[channel]
@@ -96,10 +91,6 @@ class MeshSource(VolumeSource):
                 settings=tuple(voxelizer.settings.items()),
                 solid=solid,
                 identity=tuple(identity),
-                command_options=options
-                if texture is None
-                else (*options, "--texture", str(texture)),
-                one_of_several=len(names) > 1,
                 mesh=voxelizer.mesh,
             )
         return sources
@@ -116,11 +107,6 @@ class MeshSource(VolumeSource):
         """Returns values that identify the mesh, the channel and the settings."""
         settings = {**dict(self.settings), "solid": self.solid}
         return [*self.identity, self.channel, *settings.values()]
-
-    def command(self, store: str) -> tuple[str, ...]:
-        """Returns the words of the `gvtorch voxelize` command that makes a store of it."""
-        store = str(Path(store).parent) if self.one_of_several else store
-        return ("gvtorch", "voxelize", self.path, "-o", store, *self.command_options)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
         low, high = [span.start for span in index[:3]], [span.stop for span in index[:3]]

@@ -23,7 +23,7 @@ from ..base.messages import need_library
 from ..points.points import Points
 from .budget import MAX_UNPACK_RATIO, header_budget
 from .packed import is_packed_fits
-from .resources import amount, memory_free
+from .resources import check_memory, memory_free
 from .source import convert_errors, number_type
 
 ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
@@ -148,9 +148,7 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
 
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(path) as archive:
-        size, free = sum(member.file_size for member in archive.infolist()), memory_free()
-    if size > free:
-        raise ValueError(f"it unpacks to {amount(size)}, {amount(free)} of memory are free")
+        check_memory(str(path), sum(member.file_size for member in archive.infolist()))
     with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
         return dict(content)
 

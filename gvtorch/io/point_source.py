@@ -7,7 +7,7 @@ from __future__ import annotations
 import functools
 import json
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,13 +38,10 @@ class SplatSource(VolumeSource):
 
     folder: str
     identity: tuple[Any, ...]  # of points and settings: equal while these are unchanged
-    command_options: tuple[str, ...]  # options of the command line that makes the store
 
     @classmethod
     def of(cls, folder: Path, channel: str, **fields: Any) -> SplatSource:
-        """Returns the sorted points of a folder as a volume; `fields` are path, identity and
-        command_options.
-        """
+        """Returns the sorted points of a folder as a volume; `fields` are path and identity."""
         _open_sorted.cache_clear()  # other points may have been there
         points = _open_sorted(str(folder))
         x, y, z = points.grid.extent
@@ -64,10 +61,6 @@ class SplatSource(VolumeSource):
     def fingerprint(self) -> list[Any]:
         """Returns values that identify the points and the settings."""
         return list(self.identity)
-
-    def command(self, store: str) -> tuple[str, ...]:
-        """Returns the words of the `gvtorch splat` command that makes a store of it."""
-        return ("gvtorch", "splat", self.path, "-o", store, *self.command_options)
 
     def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
         low, high = (
@@ -149,7 +142,6 @@ def splat(
         channel,
         path="points" if isinstance(points, Points) else str(points),
         identity=tuple(identity),
-        command_options=_command_options(extent, channel, opacity, box, names),
     )
     return convert(
         volume,
@@ -190,24 +182,3 @@ def _points_identity(points: str | Path | Points) -> list[Any]:
         return fingerprint(points)
     columns = (points.positions, points.values, points.colors, points.radius)
     return [len(points), checksum(column for column in columns if column is not None)]
-
-
-def _command_options(
-    extent: int | Sequence[int],
-    channel: str,
-    opacity: float,
-    box: Sequence[Sequence[float]] | None,
-    names: ColumnNames,
-) -> tuple[str, ...]:
-    """Returns the options of the command line that makes the same store."""
-    sizes = [extent] if isinstance(extent, int) else extent
-    options = ["--extent", ",".join(map(str, sizes)), "--channel", channel]
-    options += ["--opacity", f"{opacity:g}"] if channel == "color" else []
-    options += ["--box", ",".join(f"{n!r}" for end in box for n in end)] if box else []
-    for name, value in names.items():
-        if value is not None:
-            parts = [str(value)]
-            if isinstance(value, Iterable) and not isinstance(value, str):
-                parts = [str(part) for part in value]
-            options += [f"--{name}", ",".join(parts)]
-    return tuple(options)

@@ -22,8 +22,8 @@ from ..base.volume import Volume, check_extent
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
-from .remote import fetch, is_file_url, split_url
-from .resources import amount, memory_free
+from .remote import fetch, is_file_url
+from .resources import check_memory
 from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
 from .stores.ngff import is_zarr
 from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES, StoreError
@@ -175,11 +175,9 @@ def _find_opener(
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
         known_options: tuple[str, ...] = ("axes",)
     else:
-        text, key = split_url(str(path))
+        text, key = split_path(str(path))
         if is_file_url(text):
             text = str(fetch(text))
-        elif key is None:
-            text, key = split_path(text)
         if key is not None:
             arguments["key"] = key.strip("/") if is_zarr(text) else key
         if not is_zarr(text) and not Path(text).exists():
@@ -217,11 +215,7 @@ def read_time_points(source: VolumeSource, first: int = 0, times: int = 1) -> np
     # A file that is mapped is not copied.
     is_mapped = isinstance(source, ArraySource) and not source.whole and same_dtype
     if not isinstance(source, MemorySource) and not is_mapped:
-        free, needed = memory_free(), source.peak_bytes + (times - 1) * source.nbytes
-        if needed > free:
-            raise ValueError(
-                f"{source.path}: takes {amount(needed)} of memory, {amount(free)} are free"
-            )
+        check_memory(source.path, source.peak_bytes + (times - 1) * source.nbytes)
     kind = "an array" if is_array else find_format(source.path, raw=True).name
     with convert_errors(
         ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError

@@ -47,12 +47,6 @@ def is_file_url(text: str) -> bool:
     )
 
 
-def split_url(text: str) -> tuple[str, str | None]:
-    """Splits `https://host/file.h5:/group/data` into the URL and the path inside the file."""
-    match = re.fullmatch(r"(\w+://.+\.\w+):(/.+)", text)
-    return (match[1], match[2]) if match else (text, None)
-
-
 def cache_limit() -> int:
     """Returns the most bytes that the cache may hold."""
     text = os.environ.get("GVTORCH_CACHE_GB", "50")

@@ -38,6 +38,12 @@ def memory_free() -> int:
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
 
 
+def check_memory(context: str, nbytes: int) -> None:
+    """Raises ValueError if fewer than `nbytes` bytes of memory are available."""
+    if nbytes > (free := memory_free()):
+        raise ValueError(f"{context}: takes {amount(nbytes)} of memory, {amount(free)} are free")
+
+
 @contextmanager
 def worker_processes(count: int) -> Iterator[Executor]:
     """Starts worker processes, which ignore Ctrl-C from the start and leave it to this process."""

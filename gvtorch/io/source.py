@@ -8,20 +8,17 @@ world.
 
 from __future__ import annotations
 
-import bz2
 import dataclasses
-import gzip
 import math
 import os
 import re
-import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import time_ns
-from typing import IO, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -30,6 +27,7 @@ from ..base.image_info import ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
 from ..base.whole_file import name_in_errors, save_npy
+from .packed import open_unpacked
 from .stores.store_layout import value_dtype
 
 Index = tuple[slice, ...]
@@ -128,10 +126,6 @@ class VolumeSource(ABC):
         """Returns values that change with the content; None if the files at `path` identify it."""
         return None
 
-    def command(self, store: str) -> tuple[str, ...]:
-        """Returns the words of the command line that makes a store of it."""
-        return ("gvtorch", "convert", self.path, store)
-
     def covers(self, index: Index) -> bool:
         """Returns whether an index covers the whole array."""
         return all(s.stop - s.start == n for s, n in zip(index, self.shape, strict=True))
@@ -190,6 +184,8 @@ class ArraySource(VolumeSource):
 
     file: str  # holds the array
     member: str = ""  # the file inside it, if it is a ZIP archive
+    codec: str = ""  # "gzip", "bz2" or "zlib", if the file's ending does not say it
+    start: int = 0  # bytes before the packed array, in the file
     offset: int = 0  # bytes before the array, in the unpacked file
     fortran: bool = False  # first axis fastest
     exact: bool = False  # nothing may follow the array
@@ -208,7 +204,7 @@ class ArraySource(VolumeSource):
             )
             return data[index]
         content, size = np.empty(self._expected_bytes + self.exact, np.uint8), 0
-        with open_unpacked(self.file, self.member) as stream:
+        with open_unpacked(self.file, self.member, self.codec, self.start) as stream:
             stream.read(self.offset)
             while part := stream.read(min(_PART_BYTES, len(content) - size)):
                 content[size : size + len(part)] = memoryview(part)
@@ -343,16 +339,6 @@ def number_type(name: str) -> str | None:
     return _DTYPE_CODES.get(
         normalized.removesuffix(" t") if normalized[-3:-2].isdigit() else normalized
     )
-
-
-def open_unpacked(file: str, member: str = "") -> IO[bytes]:
-    """Opens a file (.gz, .bz2, plain) or a member of a ZIP archive to read its unpacked content."""
-    if member:
-        with zipfile.ZipFile(file) as archive:  # the member stays open
-            return archive.open(member)
-    if file.lower().endswith(".gz"):
-        return gzip.open(file, "rb")  # type: ignore[return-value]
-    return bz2.open(file, "rb") if file.lower().endswith(".bz2") else open(file, "rb")
 
 
 def no_time_message(context: str, time: object, times: int) -> str:

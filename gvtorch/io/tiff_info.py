@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -19,6 +18,7 @@ import numpy as np
 
 from ..base.digits import finite_number
 from ..base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
+from ..base.messages import collected_log
 from ..base.units import NO_DEPTH, spacing_of, time_unit
 from .budget import check_beside
 from .picture_size import picture_size
@@ -35,37 +35,42 @@ _MAX_LISTED_PLANES = 1 << 22  # that OME-XML may list
 
 
 @contextmanager
-def opened_tiff(path: str) -> Iterator[tuple[Any, list[str]]]:
+def opened_tiff(path: str) -> Iterator[tuple[Any, list[logging.LogRecord]]]:
     """Opens a file with tifffile, and raises an error for damage that tifffile only logs.
 
     Yields:
-        The `TiffFile`, and the list of its warnings, which grows while it is read.
+        The `TiffFile`, and what tifffile logs, a list that grows while it is read.
 
     Raises:
         ValueError: The file is damaged.
     """
     import tifffile
 
-    handler = _TiffLog()
-    logger = logging.getLogger("tifffile")
-    logger.addHandler(handler)
-    try:
-        with tifffile.TiffFile(path) as file:
-            pages = len(file.pages)  # follows the chain of pages to its end
-            _check_ome_xml(path, file.pages.first.description if pages else "")
-            if file.is_micromanager:  # tifffile opens other files of the data set
-                for name in os.listdir(os.path.dirname(os.path.abspath(path))):
-                    if name == "NDTiff.index" or "_MMStack" in name:
-                        check_beside(path, name)
-                    if name == "NDTiff.index":
-                        index = os.path.join(os.path.dirname(path), name)
-                        for file_name in {entry[1] for entry in tifffile.read_ndtiff_index(index)}:
-                            check_beside(path, file_name)
-            yield file, handler.warnings
-            if handler.damage:
-                raise ValueError(f"{path}: damaged: {handler.damage[0]}")
-    finally:
-        logger.removeHandler(handler)
+    with collected_log("tifffile") as log, tifffile.TiffFile(path) as file:
+        pages = len(file.pages)  # follows the chain of pages to its end
+        _check_ome_xml(path, file.pages.first.description if pages else "")
+        if file.is_micromanager:  # tifffile opens other files of the data set
+            for name in os.listdir(os.path.dirname(os.path.abspath(path))):
+                if name == "NDTiff.index" or "_MMStack" in name:
+                    check_beside(path, name)
+                if name == "NDTiff.index":
+                    index = os.path.join(os.path.dirname(path), name)
+                    for file_name in {entry[1] for entry in tifffile.read_ndtiff_index(index)}:
+                        check_beside(path, file_name)
+        yield file, log
+        if damage := tiff_messages(log, damage=True):
+            raise ValueError(f"{path}: damaged: {damage[0]}")
+
+
+def tiff_messages(log: list[logging.LogRecord], *, damage: bool = False) -> list[str]:
+    """Returns the warnings of tifffile's log, or those of its messages that mean damage."""
+    messages = []
+    for record in log:
+        text = " ".join(record.getMessage().split())[:200]
+        is_damage = record.levelno >= logging.ERROR or "invalid page offset" in text
+        if record.levelno >= logging.WARNING and is_damage == damage:
+            messages.append(text)
+    return messages
 
 
 def _check_ome_xml(path: str, description: str) -> None:
@@ -146,22 +151,6 @@ def _unpack_lerc(packed: bytes, max_bytes: int) -> bytes:
 
         return bytes(imagecodecs.zstd_decode(packed, out=max_bytes))
     return zlib.decompressobj().decompress(packed, max_bytes) if packed[:1] == b"x" else packed
-
-
-class _TiffLog(logging.Handler):
-    """Collects what tifffile logs in this thread."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.thread = threading.get_ident()
-        self.damage: list[str] = []
-        self.warnings: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self.thread:
-            text = " ".join(record.getMessage().split())[:200]
-            is_error = record.levelno >= logging.ERROR or "invalid page offset" in text
-            (self.damage if is_error else self.warnings).append(text)
 
 
 def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:

@@ -107,10 +107,15 @@ def outcome(call: Callable[[], Any], *expected_errors: type[BaseException]) -> s
 FREE = 2 * 10**8  # bytes: a sparse grid of a few kB may claim a huge box, and is read if it fits
 
 
+def refuse_large(context: str, nbytes: int) -> None:
+    if nbytes > FREE:
+        raise ValueError(f"{context}: takes {nbytes} bytes")
+
+
 @pytest.fixture(autouse=True)
 def short_budget(monkeypatch):
     monkeypatch.setattr(budget, "SECONDS", 2.0)
-    monkeypatch.setattr(reading, "memory_free", lambda: FREE)
+    monkeypatch.setattr(reading, "check_memory", refuse_large)
 
 
 # --- readers

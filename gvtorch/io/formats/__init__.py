@@ -5,6 +5,7 @@ torch is not imported here, so that the command line can list the formats quickl
 
 import importlib
 import pkgutil
+import re
 from pathlib import Path
 
 from .format import FORMATS, Format
@@ -37,9 +38,11 @@ def find_format(path: str, *, raw: bool = False) -> Format:
 
 
 def split_path(text: str) -> tuple[str, str | None]:
-    """Splits `file.h5:/group/data` or `image.zarr:/labels/cells` into the file and the path inside
-    it; other paths are returned whole, with None.
+    """Splits `file.h5:/group/data`, `image.zarr:/labels/cells` or `https://host/file.h5:/data` into
+    the file and the path inside it; other paths and URLs are returned whole, with None.
     """
+    if match := re.fullmatch(r"(\w+://.+\.\w+):(/.+)", text):
+        return match[1], match[2]
     file, separator, inner_path = text.rpartition(":/")
     if separator and "://" not in text and not Path(text).exists() and Path(file).exists():
         return file, f"/{inner_path}"

@@ -120,7 +120,7 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
     names = [str(name or "") for name in names] if isinstance(names, list) else []
     steps: list[tuple[float, float] | None] = [None] * len(shape)
     units: list[str | None] = [None] * len(shape)
-    axis_order, dropped = None, []
+    axis_order, dropped = None, list[str]()
     if len(names) == len(shape):
         axis_order = named_axes(names, shape) if axes is None else None
         for axis, name in enumerate(names):
@@ -137,10 +137,8 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                     values = Deadline(_READ_TIMEOUT).wait(
                         begin_read(coordinates, files), str(sibling)
                     )
-                    steps[axis], is_even = even_steps(values)
+                    steps[axis] = even_steps(name, values, dropped)
                     units[axis] = str(_read_attributes(str(sibling)).get("units", "")) or None
-                    if not is_even:
-                        dropped.append(f"that coordinates along {name} are not evenly spaced")
     axis_order = axis_order or ask_axes(path, shape, axes)
     placement, info_fields = axes_placement(axis_order, shape, steps, units)
     quantity = attributes.get("units")

@@ -87,9 +87,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         dataset = file[name]
         _check_dataset(path, name, dataset)
         shape = tuple(int(n) for n in dataset.shape)
-        axis_order, steps, units, dropped = _axes(
-            f"{path}:/{name.strip('/')}", dataset, shape, axes
-        )
+        axis_order, steps, units, dropped = _axes(path, dataset, shape, axes)
         info, value_fields = _info(dataset, axis_order, shape), _value_fields(dataset)
         placement, info_fields = axes_placement(axis_order, shape, steps, units)
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
@@ -136,11 +134,25 @@ def _check_files(path: str, file: Any, name: str, links_left: int = _MAX_LINKS) 
         if not isinstance(item, h5py.Group):
             break
     if isinstance(item, h5py.Dataset):
-        for file_name, *_ in item.external or ():
-            _check_other_file(path, file_name, None, links_left)
-        for source in item.virtual_sources() if item.is_virtual else ():
-            if source.file_name != ".":
-                _check_other_file(path, source.file_name, source.dset_name, links_left)
+        _check_sources(path, item, links_left)
+
+
+def _check_sources(path: str, dataset: Any, links_left: int = _MAX_LINKS) -> None:
+    """Checks where the values of a data set of `path` lie, if that is elsewhere. Names with % are
+    refused: HDF5 puts numbers there, so they stand for names that can't be checked here.
+    """
+    for file_name, *_ in dataset.external or ():
+        _check_other_file(path, file_name, None, links_left)
+    for source in dataset.virtual_sources() if dataset.is_virtual else ():
+        if "%" in source.file_name + source.dset_name:
+            raise ValueError(
+                f"{path}: refers to {source.dset_name} of {source.file_name}; names with % "
+                "are not read"
+            )
+        if source.file_name == ".":
+            _check_files(path, dataset.file, source.dset_name, links_left - 1)
+        else:
+            _check_other_file(path, source.file_name, source.dset_name, links_left)
 
 
 def _check_other_file(path: str, file_name: str, name: str | None, links_left: int) -> None:
@@ -211,7 +223,7 @@ def _check_dataset(path: str, name: str, dataset: Any) -> None:
 
 
 def _axes(
-    context: str, dataset: Any, shape: tuple[int, ...], axes: str | None
+    path: str, dataset: Any, shape: tuple[int, ...], axes: str | None
 ) -> tuple[str, list[tuple[float, float] | None], list[str | None], list[str]]:
     """Returns letter, (step, first position) and unit of each axis, and metadata not kept."""
     rank = len(shape)
@@ -231,7 +243,7 @@ def _axes(
         if _text(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
             continue
         if scale is not None:
-            _check_files(context, scale.file, scale.name or "/")
+            _check_sources(path, scale)
         if shape[axis] > _MAX_COORDINATES:
             continue
         if (
@@ -239,9 +251,7 @@ def _axes(
             and scale.shape == shape[axis : axis + 1]
             and scale.dtype.kind in "iuf"
         ):
-            steps[axis], is_even = even_steps(scale[()])
-            if not is_even:
-                dropped.append(f"that coordinates along {names[axis]} are not evenly spaced")
+            steps[axis] = even_steps(names[axis], scale[()], dropped)
     tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]
@@ -253,6 +263,7 @@ def _axes(
     axis_order = named_axes(names, shape) if axes is None else None
     if axis_order is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
         axis_order = "-" * (rank - 3) + "zyx"
+    context = f"{path}:/{dataset.name.strip('/')}"
     return axis_order or ask_axes(context, shape, axes), steps, units, dropped
 
 

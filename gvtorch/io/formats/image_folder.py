@@ -19,7 +19,7 @@ import numpy as np
 from ...base.image_info import ImageInfo, color_channels
 from ...base.volume import check_extent
 from ..picture_size import has_jpeg_end, picture_size
-from ..resources import amount, memory_free
+from ..resources import check_memory
 from ..source import Index, VolumeSource, convert_errors
 from ..stores.ngff import is_zarr
 from ..tiff_info import check_pictures, opened_tiff
@@ -86,12 +86,9 @@ def open_folder(path: str) -> SlicesSource:
             "DICOM files"
         )
     files.sort(key=lambda file: _natural_key(file.name))
-    shape, free = _header_shape(str(files[0])), memory_free()
+    shape = _header_shape(str(files[0]))
     check_extent(str(files[0]), shape, max_values=_MAX_PIXELS)
-    if 8 * math.prod(shape) > free:
-        raise ValueError(
-            f"{files[0]}: {shape} pixels may take more than {amount(free)}, what is free"
-        )
+    check_memory(str(files[0]), 8 * math.prod(shape))
     first = _decode_image(str(files[0]))
     if first.ndim not in (2, 3):
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")

@@ -17,8 +17,8 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.units import length_unit
-from ..packed import PackedSource
 from ..source import LPS_TO_RAS, ArraySource, VolumeSource, number_type, place_axes
+from ..text_source import TextSource
 from .format import Format
 
 _LONG_TYPES = {"MET_LONG": "i4", "MET_ULONG": "u4"}
@@ -67,11 +67,10 @@ def open_metaimage(path: str) -> VolumeSource:
     data_file = path if is_local else str(Path(path).parent / data_name)
     offset = end if is_local else int(header.get("HeaderSize", 0))
     if header.get("BinaryData", "True").lower() != "true":
-        return PackedSource(file=data_file, offset=offset, codec="text", fortran=True, **fields)
+        return TextSource(file=data_file, offset=offset, fortran=True, **fields)
     if header.get("CompressedData", "False").lower() == "true":
-        return PackedSource(
-            file=data_file, offset=max(offset, 0), codec="zlib", fortran=True, **fields
-        )
+        fields |= {"codec": "zlib", "start": max(offset, 0), "whole": True, "exact": True}
+        return ArraySource(file=data_file, fortran=True, **fields)
     if offset < 0:  # the numbers are at the end of the file
         needed_bytes = math.prod(fields["shape"]) * np.dtype(number_dtype).itemsize
         offset = max(0, os.stat(data_file).st_size - needed_bytes)

@@ -6,16 +6,15 @@ Source: "NIfTI-1 data format", nifti1.h (nifti.nimh.nih.gov), dim, xyzt_units, i
 
 from __future__ import annotations
 
-import logging
 import math
 import os
-import threading
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo, color_channels
+from ...base.messages import collected_log
 from ...base.units import length_unit, time_unit
 from ..budget import MAX_UNPACK_RATIO
 from ..source import ArraySource, Index, VolumeSource, place_axes
@@ -125,32 +124,10 @@ def _components(data: np.ndarray) -> np.ndarray:
     return parts[..., None, :] if parts.ndim == 4 else parts
 
 
-class _HeaderLog(logging.Filter):
-    """Collects what nibabel logs about a header while one is read, instead of printing it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines = threading.local()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Returns whether a record may be printed: it is not of a header read in this thread."""
-        lines: list[str] | None = getattr(self.lines, "here", None)
-        if lines is not None:
-            lines.append(record.getMessage())
-        return lines is None
-
-
-_HEADER_LOG = _HeaderLog()
-
-
 def _load(path: str) -> tuple[Any, list[str]]:
     """Returns the image, and what nibabel corrected in its header."""
     import nibabel
 
-    nibabel.imageglobals.logger.addFilter(_HEADER_LOG)  # further calls add nothing
-    corrections: list[str] = []
-    _HEADER_LOG.lines.here = corrections
-    try:
-        return nibabel.load(path), corrections
-    finally:
-        _HEADER_LOG.lines.here = None
+    with collected_log("nibabel.global") as log:
+        image = nibabel.load(path)
+    return image, [record.getMessage() for record in log]

@@ -7,7 +7,8 @@ import zipfile
 import numpy as np
 
 from ...base.named_axes import ask_axes
-from ..source import ArraySource, open_unpacked
+from ..packed import open_unpacked
+from ..source import ArraySource
 from .format import Format, choose, not_chosen
 
 

@@ -17,14 +17,14 @@ from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.named_axes import ask_axes
 from ...base.units import length_unit, time_unit
 from ..budget import check_regular
-from ..packed import PackedSource
 from ..source import ArraySource, VolumeSource, number_type, place_axes
+from ..text_source import TextSource
 from .format import Format
 
 _ENCODINGS = {
     **{"raw": "raw"},
     **dict.fromkeys(("txt", "text", "ascii"), "text"),
-    **dict.fromkeys(("gz", "gzip"), "zlib"),
+    **dict.fromkeys(("gz", "gzip"), "gzip"),
     **dict.fromkeys(("bz2", "bzip2"), "bz2"),
 }
 _MAX_SKIPPED_BYTES = 1 << 24  # of one line, or of unpacked data
@@ -102,9 +102,10 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
             needed_bytes = math.prod(shape) * np.dtype(number_dtype).itemsize
             array_start = max(start, size - needed_bytes)
         return ArraySource(file=data_file, offset=array_start, fortran=True, exact=True, **fields)
-    return PackedSource(
-        file=data_file, offset=data_start, skip=skip_bytes, codec=encoding, fortran=True, **fields
-    )
+    if encoding == "text":
+        return TextSource(file=data_file, offset=data_start + skip_bytes, fortran=True, **fields)
+    fields |= {"codec": encoding, "start": data_start, "offset": skip_bytes, "whole": True}
+    return ArraySource(file=data_file, fortran=True, exact=True, **fields)
 
 
 def _skip_lines(file: str, start: int, count: int) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from ...base import boxes
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, FileMetadata, Index, VolumeSource, read_planes
-from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff
+from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff, tiff_messages
 from .format import Format, choose
 
 _PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
@@ -102,7 +102,7 @@ def _unpack_tile(page: Any, keyframe: Any, tile_number: int) -> np.ndarray | Non
 )  # pyramids: a series is its finest level
 def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
-    with opened_tiff(path) as (file, tiff_warnings):
+    with opened_tiff(path) as (file, log):
         if not file.series:
             raise ValueError("it holds no images")
         chosen, others = choose(path, "series", [item.name for item in file.series], key)
@@ -111,7 +111,9 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         axes = _axes(path, shape, series.axes)
         info, spacing, dropped = _read_metadata(file, series, chosen, axes, shape)
         dropped += others
-        dropped += [f"what tifffile warns of ({text})" for text in dict.fromkeys(tiff_warnings)]
+        dropped += [
+            f"what tifffile warns of ({text})" for text in dict.fromkeys(tiff_messages(log))
+        ]
         fields: dict[str, Any] = {
             "path": path,
             "shape": shape,

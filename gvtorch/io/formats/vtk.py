@@ -18,14 +18,14 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import unquote
 from xml.etree import ElementTree
-from xml.parsers import expat
 
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.volume import check_extent
-from ..packed import PackedSource, text_numbers, unpack_block
+from ..packed import unpack_block
 from ..source import ArraySource, Index, VolumeSource, number_type, place_axes
+from ..text_source import TextSource, text_numbers
 from .format import Format, choose
 
 _LONG_TYPES = {"long": "i8", "unsigned_long": "u8", "vtktypeint64": "i8", "vtktypeuint64": "u8"}
@@ -53,15 +53,19 @@ class VtkSource(VolumeSource):
     encoding: str  # "raw", "base64" or "ascii"
     compressor: str  # "zlib", "lzma", "lz4", or none
     size_dtype: str  # dtype of the sizes before the data
-    offset: int
-    length: int  # bytes of the file that may belong to it
+    number: int  # of its DataArray in the file
+    offset: int | None  # where its data begin in the file; None if the DataArray holds them
     whole: bool = True
 
     def read_stored(self, index: Index) -> np.ndarray:
         count, dtype = math.prod(self.shape), np.dtype(self.stored)
-        with open(self.path, "rb") as file:
-            file.seek(self.offset)
-            content = file.read(self.length)
+        if self.offset is None:
+            root = ElementTree.fromstring(_read_xml(self.path)[0])
+            content = (list(root.iter("DataArray"))[self.number].text or "").encode()
+        else:
+            with open(self.path, "rb") as file:
+                file.seek(self.offset)
+                content = file.read()
         if self.encoding == "ascii":
             text = io.BytesIO(content)
             return text_numbers(self.path, text, count, self.stored, exact=True).reshape(
@@ -172,15 +176,15 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     compressor = _COMPRESSORS[root.get("compressor", "")]
     fields = _source_fields(path, points, affine, array, dropped)
     fields["stored"] = byte_order + number_dtype
-    encoding, offset, length = _xml_span(path, xml, appended, array)
-    if encoding == "raw" and not compressor:
+    encoding, offset = _xml_place(path, appended, array)
+    if encoding == "raw" and offset is not None and not compressor:
         return ArraySource(file=path, offset=offset + np.dtype(size_dtype).itemsize, **fields)
     return VtkSource(
         encoding=encoding,
         compressor=compressor,
         size_dtype=size_dtype,
+        number=array["number"],
         offset=offset,
-        length=length,
         **fields,
     )
 
@@ -263,49 +267,19 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
     return sorted(arrays, key=lambda array: not array["first"])
 
 
-def _xml_span(
-    path: str, xml: bytes, appended: re.Match[bytes] | None, array: dict[str, Any]
-) -> tuple[str, int, int]:
-    """Returns how an array is encoded, where it begins in the file, and how many bytes of the file
-    may belong to it.
-    """
+def _xml_place(
+    path: str, appended: re.Match[bytes] | None, array: dict[str, Any]
+) -> tuple[str, int | None]:
+    """Returns how an array is encoded, and where it begins in the file if its data are appended."""
     if array["format"] != "appended":
-        encoding = "ascii" if array["format"] == "ascii" else "base64"
-        return encoding, *_inline_span(xml, array["number"])
+        return "ascii" if array["format"] == "ascii" else "base64", None
     if appended is None:
         raise ValueError(f"{path}: has no appended data")
     offset = appended.end() + array["offset"]
     size = os.stat(path).st_size
     if offset >= size:
         raise ValueError(f"{path}: {array['name']} begins at {offset}, the file has {size} bytes")
-    return "base64" if b"base64" in appended.group() else "raw", offset, size - offset
-
-
-def _inline_span(content: bytes, number: int) -> tuple[int, int]:
-    """Returns the offset and length of the content of a DataArray, by its number in the file."""
-    spans: list[list[int]] = []
-    parser = expat.ParserCreate()
-
-    def ended_tag(_text: str) -> None:
-        """Records where the content behind a tag begins."""
-        parser.DefaultHandler = None
-        spans[-1][0] = parser.CurrentByteIndex
-
-    def start(name: str, _attributes: dict[str, str]) -> None:
-        parser.DefaultHandler = None
-        if name == "DataArray":
-            spans.append([0, 0])
-            parser.DefaultHandler = ended_tag
-
-    def end(name: str) -> None:
-        parser.DefaultHandler = None
-        if name == "DataArray" and not spans[-1][1]:
-            spans[-1][1] = parser.CurrentByteIndex
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(content, True)
-    begin, stop = spans[number]
-    return (begin, stop - begin) if begin else (0, 0)
+    return "base64" if b"base64" in appended.group() else "raw", offset
 
 
 # --- legacy
@@ -331,7 +305,7 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
     fields |= {"file": path, "offset": array["offset"], "stored": array["stored"]}
     if binary:
         return ArraySource(**fields)
-    return PackedSource(codec="shares" if array["colors"] else "text", **fields)
+    return TextSource(fractions=array["colors"], **fields)
 
 
 def _legacy_parts(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shlex
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import (
@@ -41,7 +40,7 @@ from .conversion_plan import (
     source_of,
 )
 from .store import Store
-from .store_layout import WORK, Deadline, begin_open
+from .store_layout import RESUME_ADVICE, WORK, Deadline, begin_open
 
 _TASKS_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
 _OPEN_TIMEOUT = 60.0  # seconds
@@ -196,19 +195,18 @@ def _open_executor(executor: Executor | None, plan: Plan) -> AbstractContextMana
 def _explain_resume(plan: Plan) -> Iterator[None]:
     """Adds how to resume to the error when a worker ends or the user interrupts."""
     target = plan.target
-    command = shlex.join((*plan.task.source.command(str(target)), "--resume"))
     try:
         yield
     except BrokenExecutor:
         raise OSError(
             f"{target}: a worker process ended (killed, out of memory, or started by a script "
-            f'that converts outside of `if __name__ == "__main__":`); {command} continues it'
+            f'that converts outside of `if __name__ == "__main__":`); {RESUME_ADVICE}'
         ) from None
     except KeyboardInterrupt:
         done = unfinished.count_done(target)
         raise KeyboardInterrupt(
             f"{target}: interrupted, {done} of {plan.settings['tasks']} shards are done; "
-            f"{command} continues it"
+            f"{RESUME_ADVICE}"
         ) from None
 
 

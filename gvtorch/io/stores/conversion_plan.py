@@ -120,12 +120,8 @@ def source_of(
     if not (opened.whole and read):
         return opened
     first, times = (0, opened.times) if time is None else (time, 1)
-    free, needed = resources.memory_free(), opened.peak_bytes + (times - 1) * opened.nbytes
-    if needed > free:
-        raise ValueError(
-            f"{source}: can only be read as a whole, which takes {resources.amount(needed)}, and "
-            f"{resources.amount(free)} of memory are free: unpack it first"
-        )
+    needed_bytes = opened.peak_bytes + (times - 1) * opened.nbytes
+    resources.check_memory(f"{source}: can only be read as a whole; unpack it first", needed_bytes)
     fields = {name: getattr(opened, name) for name in ("path", "spacing", "origin", "info")}
     return MemorySource.of(read_time_points(opened, first, times), **fields)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +22,7 @@ from .store_layout import (
     JOURNAL,
     MANIFEST,
     MAX_JSON_BYTES,
+    RESUME_ADVICE,
     WORK,
     Deadline,
     StoreLayout,
@@ -176,8 +176,7 @@ def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     done = (read_key(location, work_folder, JOURNAL, deadline) or b"").count(b"\n")
     return ValueError(
         f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
-        f"gvtorch convert {shlex.join((str(manifest.get('source', 'SOURCE')), location))} --resume "
-        "goes on"
+        f"{RESUME_ADVICE}"
     )
 
 

@@ -24,6 +24,7 @@ from .level_reader import Pool, StoredArray
 from .store_layout import (
     BORDER,
     CELL,
+    RESUME_ADVICE,
     Deadline,
     StoreError,
     StoreLayout,
@@ -199,7 +200,7 @@ def begin_write(
     return array[boxes.index(low, np.add(low, data.shape).tolist())].write(data)
 
 
-def finish_write(future: Any, context: str, advice: str = "--resume (resume=True) goes on") -> None:
+def finish_write(future: Any, context: str, advice: str = RESUME_ADVICE) -> None:
     """Waits for a write; `advice` ends the error message if the disk is full."""
     try:
         future.result()

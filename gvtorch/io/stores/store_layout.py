@@ -48,6 +48,7 @@ BORDER = 1  # voxels around a block; a cell's low and high cover that many aroun
 BLOCKS = (32, 64)  # voxels along a side of a block
 WORK = ".gvtorch-work"
 MANIFEST, JOURNAL = "manifest.json", "journal.jsonl"  # in it, of one store
+RESUME_ADVICE = "the same command with --resume (in Python: resume=True) goes on"
 MAX_STORE_VOXELS = 2**40
 MAX_TIMES = 2**20
 MAX_JSON_BYTES = 1 << 24  # of metadata
