@@ -244,15 +244,17 @@ ShadeArgs make_walk_args(const Op& a, bool integrates = false) {
   STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
   set_channel_args(args, a, like, nodes);
-  STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
+  const int64_t dims = integrates ? 4 : 3;
+  STD_TORCH_CHECK(a.table_lm4.dim() == dims && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2 &&
+                      a.table_lm4.size(dims - 2) == a.table_lm4.size(1) && a.table_lm4.size(dims - 1) == 4,
                   "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
   const int64_t lengths = a.table_lm4.size(0), rows = a.table_lm4.size(1);
-  const int64_t table = 4 * lengths * rows * (integrates ? rows : 1);
+  args.table = a.table_lm4.numel();
   GV_WALK(GV_CHECK_AND_SET)
   if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
-  STD_TORCH_CHECK(lengths <= INT32_MAX && rows <= INT32_MAX && table <= INT32_MAX, "gvtorch: table_lm4 is too large");
+  STD_TORCH_CHECK(args.table <= INT32_MAX, "gvtorch: table_lm4 is too large");
   STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(args.table_lm4) % 16 == 0,
                   "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
   args.nodes_per_tile = static_cast<int32_t>(a.child_tn.size(1));

@@ -47,9 +47,6 @@ struct ChannelRows : Transfer<T> {
 template <class T>
 struct ChannelMix : ShaderFacts {
   static constexpr bool kReadsAll = true;
-  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
-    return int64_t{args.lengths} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
-  }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;

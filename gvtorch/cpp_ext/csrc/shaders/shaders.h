@@ -202,9 +202,6 @@ struct Veil : ShaderFacts {
 template <class T>
 struct PreIntegrated : ShaderFacts {
   static constexpr bool kEnds = true, kIntegrates = true;
-  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
-    return int64_t{args.lengths} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
-  }
   template <class V>
   using SumOf = ShadeSum<V>;
   using Sum = SumOf<T>;
