@@ -51,7 +51,7 @@ struct UserShader : ShaderFacts {
       : transfer(args),
         light(args),
         uniform_k(static_cast<const T*>(args.parameter_54) + kParameters),
-        uniforms(args.parameters - kParameters),
+        uniforms(args.uniforms),
         other_component(args.other_component),
         step(static_cast<T>(args.step)) {}
 
@@ -67,7 +67,6 @@ struct UserShader : ShaderFacts {
 
   // True if the transfer function shows no value in [low, high].
   GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
-  GV_HD void done(ShadeSum<T>&) const {}
 };
 
 // True if a shader has UserShader's `hides`, which depends on the transfer function alone.

@@ -171,7 +171,7 @@ struct ShadeArgs : TraceArgs {
 
   VoxelType normal_voxel, other_voxel;
   int32_t other_width, other_bricks;  // numbers per voxel of the second channel; how many bricks have it
-  int32_t parameters;                 // how many numbers parameter_54 has: kParameters, then a user's uniforms
+  int32_t uniforms;                   // how many numbers follow the kParameters of parameter_54
   void *normal_r3, *features_rc;
 };
 

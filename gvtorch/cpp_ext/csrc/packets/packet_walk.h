@@ -475,12 +475,10 @@ struct PacketWalk {
   // Adds a region of one value as one interval.
   GV_HD void add_region(Mask mask) {
     Piece<Floats> piece;
-    piece.odd = true;
     piece.start = intervals.start;
     leave(mask);
     piece.end = smaller(intervals.start, intervals.stop);
-    piece.length = piece.end - piece.start;
-    piece.middle = piece.start + piece.length * 0.5f;
+    piece.set_odd();
     piece.value = piece.front = piece.back = fine.constant;
     samples = samples - mask;
     marching = mask;

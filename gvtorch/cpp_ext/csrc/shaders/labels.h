@@ -4,7 +4,7 @@
 // Equal to ops/reference/labels.py.
 #pragma once
 
-#include "shaders/plain.h"
+#include "shaders/light.h"
 
 namespace gvtorch {
 inline namespace GV_NAMESPACE {
@@ -18,9 +18,7 @@ template <class T>
 struct Labels : ShaderFacts {
   static constexpr bool kReadsAll = true;
   static constexpr int32_t kFeatures = 1;  // 1 + the row of the label where depth is recorded
-  template <class V>
-  using SumOf = ShadeSum<V>;
-  using Sum = SumOf<T>;
+  using Sum = ShadeSum<T>;
   TransferTable<T> transfer;
   T step;
   Light<T> light;
@@ -47,7 +45,7 @@ struct Labels : ShaderFacts {
     return table.opaque_m[last] == (first > 0 ? table.opaque_m[first - 1] : 0);
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     Row<V> row{};
     Vec3<V> normal{};
     probe.each_lane(mask, [&](int lane, const auto& lane_probe) {
@@ -64,7 +62,6 @@ struct Labels : ShaderFacts {
     sum.add_normal(normal, sum.clear, shown);
     sum.add_premultiplied(row, piece, shown);
   }
-  GV_HD void done(Sum&) const {}
 
  private:
   GV_HD static int32_t row_of(const Transfer<T>& table, T label) {

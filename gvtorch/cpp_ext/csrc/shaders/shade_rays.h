@@ -176,7 +176,7 @@ struct ShadeRay : Walk<T> {
       Piece<T> piece;
       piece.start = start;
       piece.end = end;
-      cut(piece);
+      piece.set_odd();
       piece.value = piece.front = piece.back = probe.value(piece.middle);
       shader.add(true, piece, probe, sum);
       ++samples;
@@ -218,7 +218,7 @@ struct ShadeRay : Walk<T> {
         piece.start = intervals.start_of(number);
         piece.end = last ? intervals.stop : intervals.start_of(number + 1);
         if (last) {
-          cut(piece);
+          piece.set_odd();
         } else {
           piece.level = intervals.level;
           piece.length = intervals.length;
@@ -236,11 +236,6 @@ struct ShadeRay : Walk<T> {
       const int32_t taken = static_cast<int32_t>(number - intervals.count);
       samples += taken;
       return taken;
-    }
-    GV_HD static void cut(Piece<T>& piece) {
-      piece.odd = true;
-      piece.length = piece.end - piece.start;
-      piece.middle = piece.start + piece.length * static_cast<T>(0.5);
     }
     template <class ActiveShader>
     GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
