@@ -24,8 +24,7 @@
 
 #include "shaders/shade_rays.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Names the uniforms, numbers that Python sets; each name becomes an index for `uniform`.
 #define GV_UNIFORMS(...)                             \
@@ -162,7 +161,6 @@ struct CalledShader : Kind<T> {
 #endif
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE
 
 namespace gv = gvtorch;

@@ -20,8 +20,7 @@
 #include "base/simd.h"
 #endif
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 template <class T>
 struct LanesOf {
@@ -340,5 +339,4 @@ GV_HD T absorbed_by(T halvings) {
   return select(thin, exp2_slope(-halvings) * halvings, 1 - exp2_exact(-halvings));
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -18,8 +18,7 @@
 #include "base/arguments.h"
 #include "walk/tree.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kListed = 1, kCounted = 2, kTouched = 4;
 
@@ -534,5 +533,4 @@ struct CutBricks {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

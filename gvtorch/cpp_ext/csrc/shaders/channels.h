@@ -23,8 +23,7 @@
 
 #include "shaders/light.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // A whole number that a table holds, clamped to [0, maximum].
 template <class T>
@@ -130,5 +129,4 @@ struct ChannelMix : ShaderFacts {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -6,8 +6,7 @@
 
 #include "shaders/light.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kMaxReach = 3;  // voxels
 
@@ -158,5 +157,4 @@ struct Labels : ShaderFacts {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -10,8 +10,7 @@
 #include "shaders/probe.h"
 #include "walk/shade.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // The transfer function's colour of a value, and its alpha over an interval of any length.
 template <class T, class V>
@@ -289,5 +288,4 @@ GV_HD Plain<T, Transfer<T>> ready_for_ray(const Plain<T>& shader) {
   return Plain<T, Transfer<T>>(shader);
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -12,8 +12,7 @@
 
 #include "shaders/shaders.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Digits: see `with_digits`. Voxel: dtype of the shader's value; void: known at run time only.
 template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
@@ -283,5 +282,4 @@ struct HideShaded {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -44,8 +44,7 @@
 #include "shaders/labels.h"
 #include "shaders/stored_color.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // The transfer function, lit.
 template <class T>
@@ -504,5 +503,4 @@ auto with_shader(int32_t kind, const Body& body) {
 #undef GV_CASE
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -5,8 +5,7 @@
 
 #include "shaders/light.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Reads one of a voxel's two sides along an axis: the numbers from `first` on where a ray goes in the axis' direction,
 // those from first + per_side on in lanes of `against`, where it goes against it.
@@ -199,5 +198,4 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -5,8 +5,7 @@
 #include "base/arguments.h"
 #include "base/arithmetic.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Red, green, blue, and the alpha of an interval; aligned for load_row and for packets.
 template <class T>
@@ -282,5 +281,4 @@ struct ShadeSum {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE
