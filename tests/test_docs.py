@@ -64,7 +64,7 @@ FOREIGN = {
     *("glClipControl", "glDepthFunc", "Bone"),
     # what a reader replaces by a name, a number or a file
     *("COLUMN", "VOLUME", "RRGGBB", "_XxYxZ_dtype", "ex", "ey", "ez", "tx", "ty"),
-    *("open_NAME", "entry_NAME", "_take_NAME", "test_formats_"),
+    *("open_NAME", "_take_NAME", "test_formats_"),
     *("smoke", "hyg_stars", "scan_512x512x300_int16"),
 }
 #: Fields of a syntax tree's nodes that hold names.

@@ -12,6 +12,7 @@ from helpers.rays import camera_rays
 from torch import Tensor
 
 import gvtorch as gv
+from gvtorch.tracing.tracer import Tracer
 
 
 def looks(*components: int) -> list[gv.ChannelLook]:
@@ -99,3 +100,28 @@ def test_bricks_beyond_2_gib_are_read_as_others_are(name, dtype):
     assert near.alpha.max() > 0.3 and (bricks.stamp_b[first:] == tree.frame).any()
     for field, there in vars(near).items():
         assert there is None or torch.equal(getattr(hits, field), there), field
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", ["plain", "lit"])
+def test_a_table_beyond_2_gib_is_read_as_others_are(name):
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.linspace(0, 1, 12**3).view(12, 12, 12)), 4)
+    rays = camera_rays(tree, 9, distance=1.4)
+    tracer = Tracer(tree, SHADERS[name], gv.RenderOptions(lod="finest"))
+    arguments, used = tracer.arguments, 64  # rows from the value 0 on, all of one colour
+    hits = []
+    for unused in (0, 2**27):
+        # Pages that are never touched take no memory.
+        table = np.zeros((1, unused + used, 4), np.float32)
+        table[0, unused:] = (0.2, 0.5, 0.9, 0.3)
+        opaque = np.zeros(unused + used, np.int32)
+        opaque[unused:] = np.arange(1, used + 1)
+        tracer.arguments = arguments._replace(
+            table_lm4=torch.from_numpy(table),
+            domain_2=torch.tensor([-unused, used - 1], dtype=torch.float32),
+            opaque_m=torch.from_numpy(opaque),
+        )
+        hits.append(tracer(rays))
+    assert hits[0].alpha.max() > 0.3
+    for field, near in vars(hits[0]).items():
+        assert near is None or torch.equal(getattr(hits[1], field), near), field

@@ -398,7 +398,7 @@ def test_every_shader_is_a_shader():
 
 
 def facts_of(struct: str, text: str, shadows: bool) -> ShaderFacts:
-    """Returns what a C++ struct declares, see `ShaderFacts` in csrc/shaders/plain.h."""
+    """Returns what a C++ struct declares, see `ShaderFacts` in csrc/shaders/light.h."""
     body = text.partition(f"struct {struct} ")[2].partition("\n};")[0]
     declared = dict(re.findall(r"\bk(\w+) = ([\w<>:]+)", body))
     features = declared.get("Features", "0")

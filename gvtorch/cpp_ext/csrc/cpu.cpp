@@ -13,29 +13,6 @@ namespace gvtorch {
 // The instruction set in use; users' shaders are compiled for the same one (cpp_ext/user.py).
 extern "C" __attribute__((visibility("default"))) const char* gvtorch_instructions() { return processor().name; }
 
-// Calls run(args, begin, end), one of `processor().chunks`, for all items of an op, `chunk_size` at a time.
-template <class Args>
-void in_chunks(void (*run)(const Args&, int64_t, int64_t), const Args& args, int64_t count, int64_t chunk_size) {
-  for_chunks(count, chunk_size, [&](int64_t begin, int64_t end) { run(args, begin, end); });
-}
-
-void voxelize(const Tensor&, const VoxelizeArgs& args) {
-  in_chunks(processor().chunks.voxelize, args, args.cubes * args.side * args.side, 16);
-}
-
-void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
-  if (is_float64(like)) return noise_each<double>(like, args, points);
-  in_chunks(processor().chunks.noise, args, points, 1 << 11);
-}
-
-void follow_points(const Tensor&, const OrbitArgs& args) {
-  in_chunks(processor().chunks.orbits, args, args.points, 1 << 9);
-}
-
-void splat_points(const Tensor&, const SplatArgs& args) {
-  in_chunks(processor().chunks.splat, args, SplatPart{args}.parts(), 1);
-}
-
 // See cache.h. Threads count chunks, then process them: ranks do not depend on the number of threads.
 template <class List>
 void compact(const Tensor&, int64_t count, const List& list) {

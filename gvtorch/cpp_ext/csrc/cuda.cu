@@ -12,34 +12,6 @@ void FusedShaders::run(const Tensor& like, ShadeArgs args, bool in_float64) {
   in_float64 ? shade_fused<double>(like, args) : shade_fused<float>(like, args);
 }
 
-template <class T>
-void voxelize_each(const Tensor& like, const VoxelizeArgs& args) {
-  const int64_t rows = args.cubes * args.side * args.side;
-  for_each(like, rows, WindRow<T>{{args}});
-  for_each(like, rows * args.side, VoxelizePack<T>{args});
-}
-
-void voxelize(const Tensor& like, const VoxelizeArgs& args) {
-  args.wide ? voxelize_each<double>(like, args) : voxelize_each<float>(like, args);
-}
-
-void make_noise(const Tensor& like, const NoiseArgs& args, int64_t points) {
-  is_float64(like) ? noise_each<double>(like, args, points) : noise_each<float>(like, args, points);
-}
-
-void splat_points(const Tensor& like, const SplatArgs& args) {
-  for_each(like, args.cubes * args.side * args.side * args.side, SplatVoxel{args});
-}
-
-void follow_points(const Tensor& like, const OrbitArgs& args) {
-  with_real(like, [&](auto real) {
-    using T = decltype(real);
-    with_step<T>(args.kind, [&](auto* step) {
-      for_each(like, args.points, FollowPoints<T, std::decay_t<decltype(*step)>>{args});
-    });
-  });
-}
-
 // `compact` of cache.h in three kernels: blocks count chunks, one block adds the counts up, and blocks process their
 // chunks. Chunks without flags are not read again.
 constexpr int kThreads = 256;

@@ -7,8 +7,7 @@
 #include "packets/packet_walk.h"
 #include "points/splat.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
   if (args.shader != kPlainShader) {
@@ -52,5 +51,4 @@ void splat_chunk(const SplatArgs& args, int64_t begin, int64_t end) {
 extern const Chunks chunks;
 const Chunks chunks = {shade_chunk, voxelize_chunk, noise_chunk, orbits_chunk, splat_chunk};
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -51,16 +51,10 @@ template struct Interface<double, UserShaderOf<double>>;
 // The shader of the library, see FusedShaders in entry.h.
 struct LibraryShader {
   using FloatShader = UserShaderOf<float>;
-  static bool integrates(int64_t) { return false; }
-  static bool filtered(int64_t) { return false; }
-  static void check(const ShadeArgs& args) {
-    constexpr int32_t features = FloatShader::kFeatures, uniforms = FloatShader::kUniforms;
-    STD_TORCH_CHECK(args.shader == 0, "gvtorch: shader must be 0");
-    const int32_t expected = features == FloatShader::kAsOther ? args.other_width : features;
-    STD_TORCH_CHECK(args.features == expected, "gvtorch: features must be ", expected, ", got ", args.features);
-    const int32_t uniform_count = args.parameters - kParameters;
-    STD_TORCH_CHECK(uniform_count >= 0 && (uniforms < 0 || uniform_count == uniforms),
-                    "gvtorch: parameter_54 holds the wrong number of uniforms: ", uniform_count);
+  static constexpr int32_t kUniforms = FloatShader::kUniforms;
+  static ShaderNeeds needs(int64_t shader) {
+    STD_TORCH_CHECK(shader == 0, "gvtorch: shader must be 0");
+    return kNeeds<FloatShader>;
   }
   static void run(const Tensor& like, ShadeArgs args, bool in_float64) {
     const auto run_kernel = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };

@@ -24,8 +24,7 @@
 
 #include "shaders/shade_rays.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Names the uniforms, numbers that Python sets; each name becomes an index for `uniform`.
 #define GV_UNIFORMS(...)                             \
@@ -51,7 +50,7 @@ struct UserShader : ShaderFacts {
       : transfer(args),
         light(args),
         uniform_k(static_cast<const T*>(args.parameter_54) + kParameters),
-        uniforms(args.parameters - kParameters),
+        uniforms(args.uniforms),
         other_component(args.other_component),
         step(static_cast<T>(args.step)) {}
 
@@ -67,7 +66,6 @@ struct UserShader : ShaderFacts {
 
   // True if the transfer function shows no value in [low, high].
   GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
-  GV_HD void done(ShadeSum<T>&) const {}
 };
 
 // True if a shader has UserShader's `hides`, which depends on the transfer function alone.
@@ -163,7 +161,6 @@ struct CalledShader : Kind<T> {
 #endif
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE
 
 namespace gv = gvtorch;

@@ -232,16 +232,18 @@ class Shadows:
         intervals = Intervals(beam, length_l[0], len(length_l))
         intervals.next(torch.ones_like(mask[ray_index]))
         limits = light.faintest(shader.stop_clear), light.scatters
-        veil = Veil(shader.transfer, shader.channel, shader, direction, torch.ones_like(t), *limits)
+        visitor = ShadowVisitor(
+            shader.transfer, shader.channel, shader, direction, torch.ones_like(t), *limits
+        )
         walk = Walk(intervals, self.walk.tree, shader.channel)
-        walk.go(veil)
+        walk.go(visitor)
         self.samples[ray_index] += walk.samples
         self.missed[ray_index] |= walk.missed
-        return torch.ones_like(length).index_put((ray_index,), veil.clear)
+        return torch.ones_like(length).index_put((ray_index,), visitor.clear)
 
 
 @dataclass
-class Veil(Visitor):
+class ShadowVisitor(Visitor):
     """The visitor of shadow cones: the transmittance through matter."""
 
     shader: Plain

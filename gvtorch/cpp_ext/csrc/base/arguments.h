@@ -95,7 +95,7 @@ using Bool = NumberOf<bool>;
   X(Voxels, bricks_bzyxc, kAny)       \
   X(Voxels, constant_tnc, args.nodes* args.voxel_width)
 
-// Node pool, transfer function, and where rays end. Sizes in limits: tiles, table, rows
+// Node pool, transfer function, and where rays end. Sizes in limits: tiles, rows
 #define GV_WALK(X)                                         \
   X(Voxels, range_tn2c, 2 * args.nodes * args.voxel_width) \
   X(Int, component, args.voxel_width)                      \
@@ -106,7 +106,7 @@ using Bool = NumberOf<bool>;
   X(Written<'c'>, stamp_b, args.bricks)                    \
   X(Words, frame_1, 1)                                     \
   X(Int, root, args.nodes)                                 \
-  X(Reals, table_lm4, table)                               \
+  X(Reals, table_lm4, kAny)                                \
   X(Reals, domain_2, 2)                                    \
   X(Words, opaque_m, rows)                                 \
   X(Float, stop_alpha, kAny)                               \
@@ -138,6 +138,7 @@ struct TraceArgs {
   uint8_t* hidden_tn;  // scratch, see allocate_node_cache
 
   int64_t rays, bricks, nodes;
+  int64_t table;  // how many numbers table_lm4 has
   VoxelType voxel;
   int32_t nodes_per_tile, side;
   int32_t voxel_width;    // numbers per voxel
@@ -170,7 +171,7 @@ struct ShadeArgs : TraceArgs {
 
   VoxelType normal_voxel, other_voxel;
   int32_t other_width, other_bricks;  // numbers per voxel of the second channel; how many bricks have it
-  int32_t parameters;                 // how many numbers parameter_54 has: kParameters, then a user's uniforms
+  int32_t uniforms;                   // how many numbers follow the kParameters of parameter_54
   void *normal_r3, *features_rc;
 };
 

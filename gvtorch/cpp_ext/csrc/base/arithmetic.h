@@ -13,20 +13,21 @@
 // Mathematical Functions", 1964, 4.1.27 (logarithm by atanh) and 4.2.1 (exponential).
 #pragma once
 
+#include <type_traits>
+
 #include "base/hd.h"
 #ifndef __CUDACC__
 #include "base/simd.h"
 #endif
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 template <class T>
 struct LanesOf {
   using Real = T;
   using Int = int32_t;
   using UInt = uint32_t;  // sums wrap
-  using Index = int32_t;  // into a table
+  using Bits = std::conditional_t<sizeof(T) == sizeof(int64_t), int64_t, int32_t>;
   using Mask = bool;
   using Pointer = T*;
   static constexpr bool kPacket = false;
@@ -113,7 +114,7 @@ struct LanesOf<Floats> {
   using Real = float;
   using Int = Ints;
   using UInt = UInts;
-  using Index = Ints;
+  using Bits = Ints;
   using Mask = Ints;
   using Pointer = LanePointers;
   static constexpr bool kPacket = true;
@@ -124,6 +125,7 @@ template <>
 struct LanesOf<Doubles> {
   using Real = double;
   using Int = Longs;
+  using Bits = Longs;
   using Mask = Longs;
 };
 
@@ -261,25 +263,13 @@ GV_HD T exp2_exact(T value) {
 // Splits a positive, normal number: it is the returned fraction, in [1/2, 1), times 2^power.
 template <class T>
 GV_HD T fraction_of(T value, IntOf<T>& power) {
-  const auto bits = bit_cast<IntOf<T>>(value);
-  power = (bits >> 23) - 126;
-  return bit_cast<T>((bits & 0x007fffff) | 0x3f000000);
+  using Word = typename LanesOf<RealOf<T>>::Bits;
+  constexpr bool kDouble = sizeof(Word) == sizeof(double);
+  constexpr Word kFractionBits = kDouble ? 52 : 23, kHalfPower = kDouble ? 1022 : 126;
+  const auto bits = bit_cast<typename LanesOf<T>::Bits>(value);
+  power = static_cast<IntOf<T>>((bits >> kFractionBits) - kHalfPower);
+  return bit_cast<T>((bits & ((Word{1} << kFractionBits) - 1)) | (kHalfPower << kFractionBits));
 }
-template <class T, class Bits>
-GV_HD T double_fraction_of(T value, Bits& power) {
-  const auto bits = bit_cast<Bits>(value);
-  power = (bits >> 52) - 1022;
-  return bit_cast<T>((bits & 0x000fffffffffffff) | 0x3fe0000000000000);
-}
-GV_HD double fraction_of(double value, int32_t& power) {
-  int64_t long_power;
-  const double fraction = double_fraction_of(value, long_power);
-  power = static_cast<int32_t>(long_power);
-  return fraction;
-}
-#ifndef __CUDACC__
-GV_HD Doubles fraction_of(Doubles value, Longs& power) { return double_fraction_of(value, power); }
-#endif
 
 // A positive, normal number split for logarithms: the exponent of the nearest power of two, and the natural logarithm
 // of the remaining factor, s * series.
@@ -349,5 +339,4 @@ GV_HD T absorbed_by(T halvings) {
   return select(thin, exp2_slope(-halvings) * halvings, 1 - exp2_exact(-halvings));
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

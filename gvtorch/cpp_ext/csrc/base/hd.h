@@ -10,9 +10,16 @@
 #include <cstring>
 
 // The CPU's kernels are compiled once for each instruction set, each in its own namespace. Otherwise the linker would
-// merge functions, which might then run instructions that a machine does not have.
+// merge functions, which might then run instructions that a machine does not have. The namespace is declared inline
+// here, and stays so in all headers.
 #ifndef GV_NAMESPACE
 #define GV_NAMESPACE plain
+#endif
+namespace gvtorch {
+inline namespace GV_NAMESPACE {}
+}  // namespace gvtorch
+#ifdef __clang__
+#pragma clang diagnostic ignored "-Winline-namespace-reopened-noninline"
 #endif
 
 #ifdef __CUDACC__
@@ -32,8 +39,7 @@
 #define GV_NO_UNROLL
 #endif
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 template <class T>
 struct Vec3 {
@@ -155,5 +161,4 @@ GV_HD void post_request(int16_t* word, int32_t request) {
 #endif
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

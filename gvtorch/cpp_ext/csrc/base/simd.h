@@ -11,8 +11,7 @@
 
 #include "base/hd.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 #if defined(__AVX512F__)
 constexpr int kLanes = 16;
@@ -222,5 +221,4 @@ GV_HD Floats4 four_numbers(const char* first) {
   return Floats4{number<float>(voxel[0]), number<float>(voxel[1]), number<float>(voxel[2]), number<float>(voxel[3])};
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -18,8 +18,7 @@
 #include "base/arguments.h"
 #include "walk/tree.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kListed = 1, kCounted = 2, kTouched = 4;
 
@@ -45,6 +44,8 @@ constexpr int32_t kKinds = kLoad | kSubdivide;
 constexpr int32_t kPending = kKinds << kPendingShift;
 
 GV_HD int32_t open_kinds(int32_t word) { return word & kKinds & ~(word >> kPendingShift); }
+// Clears a request that has been answered.
+GV_HD void clear_request(int16_t& word, int32_t kind) { word &= ~(kind | (kind << kPendingShift)); }
 
 #define GV_COMPACT_REQUESTS(X) X(Requests<'a'>, request_tn, kAny) X(Int, capacity, kAny)
 
@@ -312,7 +313,7 @@ struct WritePointer {
     const int32_t node = node_k[index];
     if (node < 0 || node >= nodes) return;
     pointer_tn[node] = word_k[index];
-    request_tn[node] &= ~(kind | (kind << kPendingShift));
+    clear_request(request_tn[node], kind);
   }
 };
 
@@ -341,7 +342,7 @@ struct LinkBrick {
     born_b[slot] = *frame_1 + 1;
     shared_b[slot] = false;
     brick_tn[node] = slot;
-    request_tn[node] &= ~(kLoad | (kLoad << kPendingShift));
+    clear_request(request_tn[node], kLoad);
   }
 };
 
@@ -391,7 +392,7 @@ struct LinkTile {
     stamp_t[tile] = *frame_1;
     shared_t[tile] = false;
     child_tn[node] = static_cast<int32_t>(tile);
-    request_tn[node] &= ~(kSubdivide | (kSubdivide << kPendingShift));
+    clear_request(request_tn[node], kSubdivide);
   }
 };
 
@@ -532,5 +533,4 @@ struct CutBricks {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

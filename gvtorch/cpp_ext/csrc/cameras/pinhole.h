@@ -4,8 +4,7 @@
 #include "base/arguments.h"
 #include "base/arithmetic.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Rows are counted through the batch: `rows` from `first`, `height` per camera. Sizes in limits: cameras
 #define GV_PINHOLE_RAYS(X)                   \
@@ -47,5 +46,4 @@ struct PinholeRays {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

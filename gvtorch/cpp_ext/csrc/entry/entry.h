@@ -244,15 +244,17 @@ ShadeArgs make_walk_args(const Op& a, bool integrates = false) {
   STD_TORCH_CHECK(a.child_tn.dim() == 2, "gvtorch: child_tn must be (t, n)");
   const int64_t tiles = a.child_tn.size(0), nodes = a.child_tn.numel();
   set_channel_args(args, a, like, nodes);
-  STD_TORCH_CHECK(a.table_lm4.dim() == (integrates ? 4 : 3) && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2,
+  const int64_t dims = integrates ? 4 : 3;
+  STD_TORCH_CHECK(a.table_lm4.dim() == dims && a.table_lm4.size(0) >= 1 && a.table_lm4.size(1) >= 2 &&
+                      a.table_lm4.size(dims - 2) == a.table_lm4.size(1) && a.table_lm4.size(dims - 1) == 4,
                   "gvtorch: table_lm4 must be (l, m, 4) with m >= 2");
   const int64_t lengths = a.table_lm4.size(0), rows = a.table_lm4.size(1);
-  const int64_t table = 4 * lengths * rows * (integrates ? rows : 1);
+  args.table = a.table_lm4.numel();
   GV_WALK(GV_CHECK_AND_SET)
   if (unread) args.request_tn = nullptr;
   STD_TORCH_CHECK(a.child_tn.size(1) >= a.branching * a.branching * a.branching, "gvtorch: child_tn has too few nodes");
   STD_TORCH_CHECK(a.width == 0 || args.rays % a.width == 0, "gvtorch: rays are no rows of this width");
-  STD_TORCH_CHECK(lengths <= INT32_MAX && rows <= INT32_MAX && table <= INT32_MAX, "gvtorch: table_lm4 is too large");
+  STD_TORCH_CHECK(args.table <= INT32_MAX, "gvtorch: table_lm4 is too large");
   STD_TORCH_CHECK(reinterpret_cast<uintptr_t>(args.table_lm4) % 16 == 0,
                   "gvtorch: table_lm4 must begin at a multiple of 16 bytes");
   args.nodes_per_tile = static_cast<int32_t>(a.child_tn.size(1));
@@ -292,36 +294,35 @@ inline int32_t check_second_channel(const std::optional<Tensor>& bricks_bzyxc,
   return static_cast<int32_t>(own_width);
 }
 
-// The shaders of a library: what they require of their arguments, and `run`, which shades all rays. A user's library
-// has a class like this one (user.cpp).
+// What a shader requires of its arguments: some of the facts of ShaderFacts.
+struct ShaderNeeds {
+  bool integrates, colored;
+  int32_t filtered, features;
+};
+template <class Shader>
+constexpr ShaderNeeds kNeeds{Shader::kIntegrates, Shader::kColored, Shader::kFiltered, Shader::kFeatures};
+
+// The shaders of a library: what each needs, and `run`, which shades all rays. A user's library has a class like this
+// one (user.cpp).
 struct FusedShaders {
-  static bool integrates(int64_t shader) {
+  static constexpr int32_t kUniforms = 0;  // how many numbers follow the kParameters; -1: any number
+  static ShaderNeeds needs(int64_t shader) {
     STD_TORCH_CHECK(shader < static_cast<int64_t>(ShaderKind::kCount), "gvtorch: shader is unknown");
     return with_shader<float>(static_cast<int32_t>(shader),
-                              [](auto type) { return decltype(type)::Shader::kIntegrates; });
-  }
-  static bool filtered(int64_t shader) {
-    return with_shader<float>(static_cast<int32_t>(shader),
-                              [](auto type) { return decltype(type)::Shader::kFiltered > 0; });
-  }
-  static void check(const ShadeArgs& args) {
-    with_shader<float>(args.shader, [&](auto type) {
-      using Shader = typename decltype(type)::Shader;
-      const bool by_other = Shader::kFeatures == Shader::kAsOther;
-      STD_TORCH_CHECK(!by_other || args.other_width > 0, "gvtorch: other_bzyxc is missing");
-      const bool colored = (args.voxel_width == 4 || args.voxel_width == 4 * kDirections) && args.component == 3;
-      STD_TORCH_CHECK(!Shader::kColored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
-      constexpr int32_t kNumbers = Shader::kFiltered;
-      const bool sided = args.other_width == kNumbers || args.other_width == kNumbers * kDirections;
-      STD_TORCH_CHECK(kNumbers == 0 || sided, "gvtorch: other_bzyxc must hold filtered colours");
-      STD_TORCH_CHECK(args.features == (by_other ? args.other_width : Shader::kFeatures),
-                      "gvtorch: features is not what the shader gives");
-    });
-    STD_TORCH_CHECK(args.parameters == kParameters, "gvtorch: parameter_54 must hold ", kParameters, " elements, got ",
-                    args.parameters);
+                              [](auto type) { return kNeeds<typename decltype(type)::Shader>; });
   }
   static void run(const Tensor& like, ShadeArgs args, bool in_float64);  // in cpu_rays.cpp and in cuda.cu
 };
+
+// Checks that the arguments are what a shader needs.
+inline void check_needs(const ShaderNeeds& needs, const ShadeArgs& args) {
+  const bool colored = (args.voxel_width == 4 || args.voxel_width == 4 * kDirections) && args.component == 3;
+  STD_TORCH_CHECK(!needs.colored || colored, "gvtorch: bricks_bzyxc must hold red, green, blue and opacity");
+  const bool sided = args.other_width == needs.filtered || args.other_width == needs.filtered * kDirections;
+  STD_TORCH_CHECK(needs.filtered == 0 || sided, "gvtorch: other_bzyxc must hold filtered colours");
+  const int32_t features = needs.features == ShaderFacts::kAsOther ? args.other_width : needs.features;
+  STD_TORCH_CHECK(args.features == features, "gvtorch: features must be ", features, ", got ", args.features);
+}
 
 #define GV_TRACE_RAYS(X) GV_RAYS(X) GV_CHANNEL(X) GV_WALK(X)
 #define GV_HITS "Tensor color_r3, Tensor alpha_r1, Tensor depth_r1, Tensor samples_r, Tensor missed_r"
@@ -340,18 +341,21 @@ GV_OP(ShadeRaysOp, "shade_rays", GV_SHADE_RAYS, "(" GV_HITS ", Tensor normal_r3,
 
 template <class Shaders>
 auto shade_rays(const ShadeRaysOp& a) {
-  ShadeArgs args = make_walk_args(a, Shaders::integrates(a.shader));
+  const ShaderNeeds needs = Shaders::needs(a.shader);
+  ShadeArgs args = make_walk_args(a, needs.integrates);
   const Like like{a.origin_r3, a.table_lm4.scalar_type()};
   GV_SHADE(GV_CHECK_AND_SET)
   check_second_channel(a.normal_bzyxc, a.normal_tnc, "normal_bzyxc", 3, args, args.normal_voxel);
-  args.other_width = check_second_channel(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel,
-                                          Shaders::filtered(a.shader));
+  args.other_width =
+      check_second_channel(a.other_bzyxc, a.other_tnc, "other_bzyxc", 0, args, args.other_voxel, needs.filtered > 0);
   STD_TORCH_CHECK(!a.other_bzyxc.has_value() || a.other_component < args.other_width,
                   "gvtorch: other_component out of range");
   args.other_bricks = a.other_bzyxc.has_value() ? static_cast<int32_t>(a.other_bzyxc->size(0)) : 0;
-  STD_TORCH_CHECK(a.parameter_54.numel() <= INT32_MAX, "gvtorch: parameter_54 is too large");
-  args.parameters = static_cast<int32_t>(a.parameter_54.numel());
-  Shaders::check(args);
+  const int64_t uniforms = a.parameter_54.numel() - kParameters;
+  STD_TORCH_CHECK(uniforms >= 0 && uniforms <= INT32_MAX && (Shaders::kUniforms < 0 || uniforms == Shaders::kUniforms),
+                  "gvtorch: parameter_54 holds the wrong number of uniforms: ", uniforms);
+  args.uniforms = static_cast<int32_t>(uniforms);
+  check_needs(needs, args);
   auto hits = make_hits(args, a.table_lm4);
   Tensor normal_r3 = make_output(args.normal_r3, a.table_lm4, {args.rays, 3});
   Tensor features_rc = make_output(args.features_rc, a.table_lm4, {args.rays, a.features});

@@ -40,10 +40,6 @@ inline namespace GV_NAMESPACE {
 constexpr double kDeepInside = 1, kLostBeyond = 1e3;  // INSIDE and FAR of the twin
 
 template <class T>
-GV_HD T squared(const Vec3<T>& z) {
-  return dot(z, z);
-}
-template <class T>
 GV_HD T from_planes(const Vec3<T>& z) {
   return smaller(smaller(absolute(z.x), absolute(z.y)), absolute(z.z));
 }
@@ -107,7 +103,7 @@ struct PowerStep {
   }
   GV_HD Stretch<T> stretch(const Vec3<T>& z, T reach) const {
     const T count = static_cast<T>(n), zero = 0, one = 1;
-    const T axis_distance = square_root(z.x * z.x + z.y * z.y), radius = square_root(squared(z));
+    const T axis_distance = square_root(z.x * z.x + z.y * z.y), radius = square_root(dot(z, z));
     const T inner_radius = larger(radius - reach, zero), outer_radius = radius + reach,
             safe_radius = larger(radius, number_of<T>(1e-30));
     const T ratio = smaller(reach / safe_radius, one);
@@ -139,13 +135,14 @@ struct FoldStep {
   }
   GV_HD Vec3<T> operator()(const Vec3<T>& z, T& factor) const {
     const Vec3<T> to = folded(z);
-    const T inverted = static_cast<RealOf<T>>(1) / clamp(squared(to), number_of<T>(0.25), number_of<T>(1));
+    const T inverted = static_cast<RealOf<T>>(1) / clamp(dot(to, to), number_of<T>(0.25), number_of<T>(1));
     const T scaled = inverted * scale;
     factor = inverted * size;
     return {to.x * scaled, to.y * scaled, to.z * scaled};
   }
   GV_HD Stretch<T> stretch(const Vec3<T>& z, T reach) const {
-    const T radius = square_root(squared(folded(z))), half = number_of<T>(0.5), one = 1;
+    const Vec3<T> to = folded(z);
+    const T radius = square_root(dot(to, to)), half = number_of<T>(0.5), one = 1;
     const T near = clamp(radius - reach, half, one), far = clamp(radius + reach, half, one);
     const T high = size / (near * near);
     return {high, size / (far * far), high};
@@ -173,14 +170,14 @@ struct FollowPoints {
       if (args.julia) constant[axis] = broadcast<T>(constants[axis]);
     }
     const Step step(args.amount);
-    T radius = square_root(squared(z)), separation = number_of<T>(1), least_radius = radius, plane = from_planes(z);
+    T radius = square_root(dot(z, z)), separation = number_of<T>(1), least_radius = radius, plane = from_planes(z);
     MaskOf<T> alive = radius <= bailout;
     for (int32_t iteration = 0; iteration < args.iterations && any(alive); ++iteration) {
       T factor;
       const Vec3<T> stepped = step(z, factor);
       for (int axis = 0; axis < 3; ++axis) z[axis] = select(alive, stepped[axis] + constant[axis], z[axis]);
       separation = select(alive, factor * separation + added_separation, separation);
-      radius = square_root(squared(z));
+      radius = square_root(dot(z, z));
       least_radius = smaller(least_radius, radius);
       plane = smaller(plane, from_planes(z));
       alive = radius <= bailout;
@@ -214,7 +211,7 @@ struct FollowBalls {
     T reach = first, low_separation = 1, high_separation = 1, low = infinity, high = -infinity;
     bool inside = true, diverged = false;  // inside: some orbit may be within the bailout radius
     for (int32_t iteration = 0;; ++iteration) {
-      const T radius = square_root(squared(z)), inner_radius = larger(radius - reach, T{}),
+      const T radius = square_root(dot(z, z)), inner_radius = larger(radius - reach, T{}),
               outer_radius = radius + reach;
       if (outer_radius > bailout) {
         low = smaller(low, estimate<Step>(larger(inner_radius, bailout), high_separation));

@@ -5,8 +5,7 @@
 #include "base/simd.h"
 #include "walk/tree.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 struct DeepLanes {
   const RayView& rays;
@@ -59,5 +58,4 @@ struct DeepLanes {
   GV_HD Digits<float> digits(int lane) const { return {tree, levels, origin[lane], cell[lane]}; }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -4,8 +4,7 @@
 
 #include "shaders/probe.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Spot for a packet. A lane with a constant has slope 0; it reads the pool's first voxels, and the result is ignored.
 struct PacketBrick {
@@ -225,5 +224,4 @@ struct AnyValues {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -12,8 +12,7 @@
 #include "packets/packet_brick.h"
 #include "shaders/shade_rays.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // A lane's Sum of those of all lanes, and back. UserSums, which keeps a Sum for each lane, has overloads, see
 // user_shader.h.
@@ -475,12 +474,10 @@ struct PacketWalk {
   // Adds a region of one value as one interval.
   GV_HD void add_region(Mask mask) {
     Piece<Floats> piece;
-    piece.odd = true;
     piece.start = intervals.start;
     leave(mask);
     piece.end = smaller(intervals.start, intervals.stop);
-    piece.length = piece.end - piece.start;
-    piece.middle = piece.start + piece.length * 0.5f;
+    piece.set_odd();
     piece.value = piece.front = piece.back = fine.constant;
     samples = samples - mask;
     marching = mask;
@@ -566,5 +563,4 @@ void trace_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
   for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

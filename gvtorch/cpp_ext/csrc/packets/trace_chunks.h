@@ -7,11 +7,12 @@
 
 namespace gvtorch {
 
-// True if packets can trace the rays. They address nodes by 32-bit byte offsets, compute offsets in a brick in floats,
-// and load 4 bytes at once: beyond a voxel, but not beyond the pool, whose last brick only single rays' functions read.
+// True if packets can trace the rays. They address nodes and the table by 32-bit byte offsets, compute offsets in a
+// brick in floats, and load 4 bytes at once: beyond a voxel, but not beyond the pool, whose last brick only single
+// rays' functions read.
 inline bool packets_can_trace(const TraceArgs& args) {
   constexpr int64_t kMaxAddressed = INT32_MAX / sizeof(int32_t);
-  return args.nodes <= kMaxAddressed && args.bricks >= 2 &&
+  return args.nodes <= kMaxAddressed && args.table <= kMaxAddressed && args.bricks >= 2 &&
          brick_bytes(args.voxel, args.side, args.voxel_width) < 1 << 24;
 }
 

@@ -21,10 +21,9 @@
 // Equal to ops/reference/channels.py. Source: Max, "Optical models for direct volume rendering", IEEE TVCG 1995.
 #pragma once
 
-#include "shaders/plain.h"
+#include "shaders/light.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // A whole number that a table holds, clamped to [0, maximum].
 template <class T>
@@ -47,12 +46,7 @@ struct ChannelRows : Transfer<T> {
 template <class T>
 struct ChannelMix : ShaderFacts {
   static constexpr bool kReadsAll = true;
-  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
-    return int64_t{args.lengths} * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
-  }
-  template <class V>
-  using SumOf = ShadeSum<V>;
-  using Sum = SumOf<T>;
+  using Sum = ShadeSum<T>;
   TransferView<T> view;
   T step;
   int32_t width;
@@ -81,7 +75,7 @@ struct ChannelMix : ShaderFacts {
     return hides;
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     probe.select_lanes(mask);
     V values[kMaxNumbers];
     probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
@@ -102,7 +96,6 @@ struct ChannelMix : ShaderFacts {
     const V alpha = absorbed_by(halvings), scale = alpha / total;
     sum.add_premultiplied({red * scale, green * scale, blue * scale, alpha}, piece, shown);
   }
-  GV_HD void done(Sum&) const {}
 
  private:
   // Calls body(i, rows) for each channel. Whatever the head holds, no row outside the table is read.
@@ -136,5 +129,4 @@ struct ChannelMix : ShaderFacts {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -4,10 +4,9 @@
 // Equal to ops/reference/labels.py.
 #pragma once
 
-#include "shaders/plain.h"
+#include "shaders/light.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kMaxReach = 3;  // voxels
 
@@ -18,9 +17,7 @@ template <class T>
 struct Labels : ShaderFacts {
   static constexpr bool kReadsAll = true;
   static constexpr int32_t kFeatures = 1;  // 1 + the row of the label where depth is recorded
-  template <class V>
-  using SumOf = ShadeSum<V>;
-  using Sum = SumOf<T>;
+  using Sum = ShadeSum<T>;
   TransferTable<T> transfer;
   T step;
   Light<T> light;
@@ -47,7 +44,7 @@ struct Labels : ShaderFacts {
     return table.opaque_m[last] == (first > 0 ? table.opaque_m[first - 1] : 0);
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     Row<V> row{};
     Vec3<V> normal{};
     probe.each_lane(mask, [&](int lane, const auto& lane_probe) {
@@ -64,7 +61,6 @@ struct Labels : ShaderFacts {
     sum.add_normal(normal, sum.clear, shown);
     sum.add_premultiplied(row, piece, shown);
   }
-  GV_HD void done(Sum&) const {}
 
  private:
   GV_HD static int32_t row_of(const Transfer<T>& table, T label) {
@@ -161,5 +157,4 @@ struct Labels : ShaderFacts {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -8,8 +8,7 @@
 #include "walk/shade.h"
 #include "walk/walk.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kMaxNumbers = 16;  // of a voxel that `numbers_at` reads at once
 
@@ -387,5 +386,4 @@ struct TypedProbe : Probe<T> {
 template <class T, class Voxel>
 using ProbeOf = std::conditional_t<std::is_void_v<Voxel>, Probe<T>, TypedProbe<T, Voxel>>;
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -231,20 +231,11 @@ struct WriteSegments {
   }
 };
 
-// A channel whose dtype the compiler knows.
-template <class Voxel>
-struct BrickView {
-  const Voxel *bricks_bzyxc, *constant_tnc;
-  int32_t side, border, width;  // width: numbers per voxel
-
-  GV_HD int64_t first_number(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * width; }
-};
-
 // Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
-template <class T, class Voxel>
+template <class T>
 struct FindSample {
-  Walk<T> walk;  // only rays and the shape of the tree
-  BrickView<Voxel> bricks;
+  Walk<T> walk;                 // only rays and the shape of the tree
+  int32_t side, border, width;  // of a channel's bricks; width: numbers per voxel
   int64_t segments, nodes;
   GV_SAMPLES(GV_TYPED_VIEW)
 
@@ -273,11 +264,11 @@ struct FindSample {
     source.valid = true;
     const Ray<T> ray(walk.rays, ray_number);
     const Digits<T> digits(tree, walk.levels, walk.rays, ray, distance_s3[3 * segment + 2]);
-    source.fine = source.coarse = Spot<T>(holders[0], digits, ray, bricks.border);
+    source.fine = source.coarse = Spot<T>(holders[0], digits, ray, border);
     source.t = middle_of(segment, number_k[k]);
     source.weight = 0;
     if (holders[1].node != holders[0].node) {
-      source.coarse = Spot<T>(holders[1], digits, ray, bricks.border);
+      source.coarse = Spot<T>(holders[1], digits, ray, border);
       const T voxel = walk.levels.voxel[wanted];
       const T blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
       const T cone = ray.cone_near + ray.cone_growth * source.t;
@@ -295,38 +286,41 @@ struct FindSample {
     const int32_t count = interval_s3[3 * segment] + number;
     return base + (static_cast<T>(count) + static_cast<T>(0.5)) * length;
   }
+  // Index of a brick's first number in the pool.
+  GV_HD int64_t first_number(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * width; }
 };
 
 template <class T, class Voxel>
 struct SampleBricks {
-  FindSample<T, Voxel> find_sample;
+  FindSample<T> find_sample;
+  const Voxel *bricks_bzyxc, *constant_tnc;
   T* value_kc = nullptr;
 
   GV_HD void operator()(int64_t k) const {
     const auto source = find_sample(k);
-    const BrickView<Voxel>& bricks = find_sample.bricks;
+    const int32_t width = find_sample.width;
     const bool mixed = source.coarse.node != source.fine.node;
-    for (int32_t c = 0; c < bricks.width; ++c) {
+    for (int32_t c = 0; c < width; ++c) {
       T value = 0;
       if (source.valid) {
         value = read(source.fine, source.t, c);
         if (mixed) value = value + source.weight * (read(source.coarse, source.t, c) - value);
       }
-      value_kc[k * bricks.width + c] = value;
+      value_kc[k * width + c] = value;
     }
   }
   GV_HD T read(const Spot<T>& spot, T t, int32_t c) const {
-    const BrickView<Voxel>& bricks = find_sample.bricks;
-    if (spot.brick < 0) return number<T>(bricks.constant_tnc[static_cast<int64_t>(spot.node) * bricks.width + c]);
-    const Voxel* voxels = bricks.bricks_bzyxc + bricks.first_number(spot.brick) + c;
-    return trilinear(voxels, bricks.side, bricks.width, spot.at(t));
+    const int32_t width = find_sample.width;
+    if (spot.brick < 0) return number<T>(constant_tnc[static_cast<int64_t>(spot.node) * width + c]);
+    const Voxel* voxels = bricks_bzyxc + find_sample.first_number(spot.brick) + c;
+    return trilinear(voxels, find_sample.side, width, spot.at(t));
   }
 };
 
 // The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of.
-template <class T, class Voxel>
+template <class T>
 struct SpreadGradient {
-  FindSample<T, Voxel> find_sample;
+  FindSample<T> find_sample;
   GV_GRADIENT(GV_TYPED_VIEW)
   T *grad_bzyxc = nullptr, *grad_tnc = nullptr;
 
@@ -337,23 +331,23 @@ struct SpreadGradient {
     if (source.coarse.node != source.fine.node) spread(source.coarse, source.t, k, source.weight);
   }
   GV_HD void spread(const Spot<T>& spot, T t, int64_t k, T share) const {
-    const BrickView<Voxel>& bricks = find_sample.bricks;
-    const T* grad_c = grad_kc + k * bricks.width;
+    const int32_t side = find_sample.side, width = find_sample.width;
+    const T* grad_c = grad_kc + k * width;
     if (spot.brick < 0) {
-      T* constant = grad_tnc + static_cast<int64_t>(spot.node) * bricks.width;
-      for (int32_t c = 0; c < bricks.width; ++c) add_to(constant + c, share * grad_c[c]);
+      T* constant = grad_tnc + static_cast<int64_t>(spot.node) * width;
+      for (int32_t c = 0; c < width; ++c) add_to(constant + c, share * grad_c[c]);
       return;
     }
-    const EightVoxels<T> corners(spot.at(t), bricks.side);
+    const EightVoxels<T> corners(spot.at(t), side);
     const auto& weight = corners.weight;
-    T* first = grad_bzyxc + bricks.first_number(spot.brick);
+    T* first = grad_bzyxc + find_sample.first_number(spot.brick);
     for (int i = 0; i < 8; ++i) {
       const int dx = i & 1, dy = i >> 1 & 1, dz = i >> 2;
       const T corner_share = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
                              (dz ? weight[2] : 1 - weight[2]);
       const int64_t z = corners.cell[2] + dz, y = corners.cell[1] + dy, x = corners.cell[0] + dx;
-      T* voxel_c = first + ((z * bricks.side + y) * bricks.side + x) * bricks.width;
-      for (int32_t c = 0; c < bricks.width; ++c) add_to(voxel_c + c, corner_share * grad_c[c]);
+      T* voxel_c = first + ((z * side + y) * side + x) * width;
+      for (int32_t c = 0; c < width; ++c) add_to(voxel_c + c, corner_share * grad_c[c]);
     }
   }
 };

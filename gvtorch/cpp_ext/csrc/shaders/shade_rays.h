@@ -12,8 +12,7 @@
 
 #include "shaders/shaders.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Digits: see `with_digits`. Voxel: dtype of the shader's value; void: known at run time only.
 template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
@@ -141,7 +140,7 @@ struct ShadeRay : Walk<T> {
   // True if light varies in a node of one value: a point light shines on a stored normal from different directions.
   GV_HD bool shades_each_position() const { return channels.normal.exists() && light.kind() == LightKind::kPoint; }
 
-  // See Walk::follow. AnyShader: the shader, or its Veil for a ray to a light.
+  // See Walk::follow. AnyShader: the shader, or its ShadowShader for a ray to a light.
   template <class AnyShader>
   struct Visitor {
     static constexpr bool kSeesEmpty = AnyShader::kSeesEmpty, kEnds = AnyShader::kEnds;
@@ -176,7 +175,7 @@ struct ShadeRay : Walk<T> {
       Piece<T> piece;
       piece.start = start;
       piece.end = end;
-      cut(piece);
+      piece.set_odd();
       piece.value = piece.front = piece.back = probe.value(piece.middle);
       shader.add(true, piece, probe, sum);
       ++samples;
@@ -218,7 +217,7 @@ struct ShadeRay : Walk<T> {
         piece.start = intervals.start_of(number);
         piece.end = last ? intervals.stop : intervals.start_of(number + 1);
         if (last) {
-          cut(piece);
+          piece.set_odd();
         } else {
           piece.level = intervals.level;
           piece.length = intervals.length;
@@ -236,11 +235,6 @@ struct ShadeRay : Walk<T> {
       const int32_t taken = static_cast<int32_t>(number - intervals.count);
       samples += taken;
       return taken;
-    }
-    GV_HD static void cut(Piece<T>& piece) {
-      piece.odd = true;
-      piece.length = piece.end - piece.start;
-      piece.middle = piece.start + piece.length * static_cast<T>(0.5);
     }
     template <class ActiveShader>
     GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
@@ -266,10 +260,10 @@ struct ShadeRay : Walk<T> {
     const Sight<T> sight(probe.sight.at(t), direction);
     Intervals<T> intervals(beam, step, lengths);
     intervals.move_to(true, intervals.count + 1);
-    const Veil<T, Shader> veil{{}, shader};
-    typename Veil<T, Shader>::Sum sum;
+    const ShadowShader<T, Shader> shadow_shader{{}, shader};
+    typename ShadowShader<T, Shader>::Sum sum;
     sum.stop_clear = light.faintest(this->stop_clear);
-    Visitor<Veil<T, Shader>> visitor{*this, veil, &beam, &sight, sum};
+    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &beam, &sight, sum};
     this->template follow<Digits>(beam, intervals, visitor);
     samples += visitor.samples;
     missed = missed || sum.missed;
@@ -288,5 +282,4 @@ struct HideShaded {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

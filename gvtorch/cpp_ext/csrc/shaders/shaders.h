@@ -44,15 +44,12 @@
 #include "shaders/labels.h"
 #include "shaders/stored_color.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // The transfer function, lit.
 template <class T>
 struct Lit : Plain<T> {
   static constexpr bool kShort = false;
-  template <class V>
-  using SumOf = ShadeSum<V>;
   using Plain<T>::transfer;
   using Plain<T>::step;
   Light<T> light;
@@ -63,7 +60,8 @@ struct Lit : Plain<T> {
     return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
   }
   template <class V, class AnyProbe, class... Shadow>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
+                 const Shadow&... shadow) const {
     Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
@@ -182,7 +180,7 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
 
 // The shader of rays to a light (shadow rays): only the transmittance through what another shader shows.
 template <class T, class Shader>
-struct Veil : ShaderFacts {
+struct ShadowShader : ShaderFacts {
   static constexpr bool kHidesAlike = Shader::kHidesAlike, kToLight = true;
   struct Sum {
     T clear = 1;     // transmittance
@@ -202,12 +200,7 @@ struct Veil : ShaderFacts {
 template <class T>
 struct PreIntegrated : ShaderFacts {
   static constexpr bool kEnds = true, kIntegrates = true;
-  static bool packets_can_trace(const ShadeArgs& args) {  // packets address the bytes of the table in 32 bits
-    return int64_t{args.lengths} * args.rows * args.rows * int64_t{sizeof(Row<float>)} <= INT32_MAX;
-  }
-  template <class V>
-  using SumOf = ShadeSum<V>;
-  using Sum = SumOf<T>;
+  using Sum = ShadeSum<T>;
   TransferTable<T> transfer;
   T step;
 
@@ -215,7 +208,7 @@ struct PreIntegrated : ShaderFacts {
 
   GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, ShadeSum<V>& sum) const {
     const Transfer<T> table(transfer);
     V lengths = broadcast<V>(static_cast<T>(1));
     if (piece.odd) lengths = piece.length / step;
@@ -241,7 +234,7 @@ struct PreIntegrated : ShaderFacts {
   GV_HD Row<V> between(const Transfer<T>& table, V from, V to, IntOf<V> level, MaskOf<V> mask) const {
     const Cell<V> front = table.find(from), back = table.find(to);
     const int32_t rows = table.rows;
-    const auto index = (static_cast<typename LanesOf<V>::Index>(level) * rows + front.row) * rows + back.row;
+    const IntOf<V> index = (level * rows + front.row) * rows + back.row;
     const RowPair<V> nearer = table.rows_at(index), farther = table.rows_at(index, rows);
     return make_row<V>(mask, [&](int column) {
       const V near = nearer.at(back.weight, column), far = farther.at(back.weight, column);
@@ -263,7 +256,6 @@ struct PreIntegrated : ShaderFacts {
     return {a.red + transmittance * b.red, a.green + transmittance * b.green, a.blue + transmittance * b.blue,
             a.alpha + transmittance * b.alpha};
   }
-  GV_HD void done(Sum&) const {}
 };
 
 // The first position where the value crosses a level, in either direction. Four bisections and a secant: an interval of
@@ -354,7 +346,6 @@ struct Isosurface : ShaderFacts {
     sum.blue = sum.share * row.blue;
     sum.normal = n;
   }
-  GV_HD void done(Sum&) const {}
 };
 
 // Maximum, minimum or mean of the value along the ray, coloured by the transfer function. A node that can't change a
@@ -424,12 +415,10 @@ struct Projection : ShaderFacts {
 template <class T>
 struct Features : Plain<T> {
   static constexpr int32_t kFeatures = Plain<T>::kAsOther;
-  template <class V>
-  using SumOf = ShadeSum<V>;
   using Plain<T>::Plain;
 
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     const Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
     const V share = sum.clear * row.alpha;
     const MaskOf<V> shown = mask && share > 0;
@@ -452,8 +441,6 @@ struct Features : Plain<T> {
 // (after Levoy 1988, "region boundary surfaces").
 template <class T>
 struct GradientMagnitude : Plain<T> {
-  template <class V>
-  using SumOf = ShadeSum<V>;
   struct Numbers {
     T full;  // gradient length of full density, in units of the value per world unit
   };
@@ -463,7 +450,7 @@ struct GradientMagnitude : Plain<T> {
       : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
@@ -516,5 +503,4 @@ auto with_shader(int32_t kind, const Body& body) {
 #undef GV_CASE
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -3,10 +3,9 @@
 // Equal to ops/reference/stored_color.py.
 #pragma once
 
-#include "shaders/plain.h"
+#include "shaders/light.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Reads one of a voxel's two sides along an axis: the numbers from `first` on where a ray goes in the axis' direction,
 // those from first + per_side on in lanes of `against`, where it goes against it.
@@ -49,9 +48,7 @@ template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
   static bool packets_can_trace(const ShadeArgs& args) { return args.voxel_width == 4; }
-  template <class V>
-  using SumOf = ShadeSum<V>;
-  using Sum = SumOf<T>;
+  using Sum = ShadeSum<T>;
   Light<T> light;
 
   explicit StoredColor(const ShadeArgs& args) : light(args) {}
@@ -75,7 +72,8 @@ struct StoredColor : ShaderFacts {
     return stretch(opacity_of(piece, probe), piece.length / numbers().reference_length);
   }
   template <class V, class AnyProbe, class... Shadow>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum, const Shadow&... shadow) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
+                 const Shadow&... shadow) const {
     const V opacity = opacity_of(piece, probe);
     const MaskOf<V> shown = mask && opacity > 0;
     if (!any(shown)) return;
@@ -119,7 +117,6 @@ struct StoredColor : ShaderFacts {
   GV_RARE static auto of_sides(const AnyProbe& probe, const Read& read) {
     return by_direction(true, probe.sight.direction, probe.channels.value.width, read);
   }
-  GV_HD void done(Sum&) const {}
 };
 
 // A transfer function, `Base`, that is right at coarse levels too: a second channel, which only the first bricks of the
@@ -132,8 +129,6 @@ struct StoredColor : ShaderFacts {
 //   add_contribution(mask, added, piece, sum)    adds it to the sum
 template <class T, class Base, class Shader>
 struct FromAfar : Base {
-  template <class V>
-  using SumOf = ShadeSum<V>;
   int32_t bricks;  // number of bricks that have the second channel
 
   explicit FromAfar(const ShadeArgs& args) : Base(args), bricks(args.other_bricks) {}
@@ -144,7 +139,7 @@ struct FromAfar : Base {
     return probe.fine.in_first_slots(bricks) || (probe.mixed && probe.coarse.in_first_slots(bricks));
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     const MaskOf<V> colored = mask && has_stored(probe), uncolored = mask && !colored;
     if (any(uncolored)) Base::add(uncolored, piece, probe, sum);
     if (!any(colored)) return;
@@ -203,5 +198,4 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

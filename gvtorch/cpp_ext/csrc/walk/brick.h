@@ -9,8 +9,7 @@
 #include "walk/ray.h"
 #include "walk/tree.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Calls body(Voxel{}) with the C++ type of a channel's voxels.
 #ifdef __CUDACC__
@@ -144,5 +143,4 @@ GV_HD T trilinear(const Voxel* voxels, int32_t side, int32_t width, Vec3<T> posi
   return trilinear(voxels, EightVoxels<T>(position, side), side, width);
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

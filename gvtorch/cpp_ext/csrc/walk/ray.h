@@ -8,8 +8,7 @@
 
 #include "base/arithmetic.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 struct RayView {
   const double* origin_r3;     // world
@@ -260,5 +259,4 @@ struct Intervals {
                      GV_BOTH(base) GV_BOTH(length) GV_BOTH(inverse_length) GV_BOTH(count) GV_BOTH(start))
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

@@ -5,8 +5,7 @@
 #include "base/arguments.h"
 #include "base/arithmetic.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Red, green, blue, and the alpha of an interval; aligned for load_row and for packets.
 template <class T>
@@ -173,8 +172,7 @@ struct Transfer {
   template <class V>
   GV_HD Row<V> look_up(V value, IntOf<V> level, MaskOf<V> mask, int32_t level_rows) const {
     const Cell<V> cell = find(value);
-    const auto index = static_cast<typename LanesOf<V>::Index>(level) * level_rows + cell.row;
-    const RowPair<V> pair = rows_at(index);
+    const RowPair<V> pair = rows_at(level * level_rows + cell.row);
     return make_row<V>(mask, [&](int column) { return pair.at(cell.weight, column); });
   }
 
@@ -215,6 +213,12 @@ struct Piece {
   T front, back;                 // values at both ends, for shaders with kEnds
   bool odd = false;              // of any length, with level 0
 
+  // Makes the interval from `start` to `end` odd.
+  GV_HD void set_odd() {
+    odd = true;
+    length = end - start;
+    middle = start + length * static_cast<RealOf<T>>(0.5);
+  }
   // Without the values, of which a shader has only some.
   GV_EACH_MEMBER(GV_BOTH(start) GV_BOTH(end) GV_BOTH(length) GV_BOTH(middle) GV_BOTH(level) GV_BOTH(odd))
 };
@@ -277,5 +281,4 @@ struct ShadeSum {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

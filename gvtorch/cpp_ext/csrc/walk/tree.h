@@ -20,8 +20,7 @@
 #include "base/arguments.h"
 #include "walk/ray.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kAbsent = -1;
 constexpr int32_t kTerminal = -2;
@@ -245,5 +244,4 @@ GV_HD Descent descend(const TreeView& tree, AnyDigits& digits, int32_t wanted, b
   }
 }
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE

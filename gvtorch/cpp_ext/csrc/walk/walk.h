@@ -8,8 +8,7 @@
 #include "walk/ray.h"
 #include "walk/shade.h"
 
-namespace gvtorch {
-inline namespace GV_NAMESPACE {
+namespace gvtorch::GV_NAMESPACE {
 
 // Whether a node is hidden. The CPU computes this when the first ray reaches a node, since most are never visited; a
 // GPU, where many threads would repeat it, does so for all nodes before the rays are traced: see NodeWords.
@@ -220,5 +219,4 @@ struct Walk {
   }
 };
 
-}  // namespace GV_NAMESPACE
-}  // namespace gvtorch
+}  // namespace gvtorch::GV_NAMESPACE
