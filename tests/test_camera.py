@@ -213,7 +213,7 @@ def _corners_along(camera: gv.Camera, box: torch.Tensor) -> list[torch.Tensor]:
 @pytest.mark.parametrize("up", ["+y", "-z"])
 def test_a_path_around_a_box_keeps_it_whole_and_its_distance(model, up):
     size = (300, 200)
-    path = gv.CameraPath.orbit(BOX, model, 25, elevation=35, up=up, fit=size)
+    path = gv.CameraPath.orbit(BOX, model, 25, elevation=35, up=up, fit_size=size)
     cameras = [path.camera(index / 60, *size, model) for index in range(61)]
     extents = [float(seen_corners(camera, BOX)[0].abs().max()) for camera in cameras]
     assert max(extents) < 1 and max(extents) > 0.95
@@ -376,7 +376,7 @@ def test_small_cameras_share_calls(monkeypatch):
         (lambda: gv.Camera.orbit(up=(0, 0, 0)), "up must not be zero"),
         (lambda: gv.Camera.orbit(up=(0, 1)), "up must be three numbers"),
         (lambda: gv.Camera.fit([[0, 0, 0], [1, 0, 1]]), "must have its low corner below"),
-        (lambda: gv.CameraPath.orbit(BOX, distance=2, fit=(8, 8)), "fit finds the distance"),
+        (lambda: gv.CameraPath.orbit(BOX, distance=2, fit_size=(8, 8)), "fit_size finds"),
         (lambda: gv.Camera.orbit(fov=0), "fov must be finite and > 0 and <= 179"),
         (lambda: gv.Camera.orbit(fov=math.nan), "fov must be finite"),
         (lambda: gv.Camera.orbit(width=0), "width must be an int >= 1"),

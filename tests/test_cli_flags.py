@@ -42,7 +42,7 @@ def test_films_of_a_volume_loop(small, tmp_path):
         if name == "a.gif":
             assert sum(duration for _, duration in frames) == 400
         path = gv.CameraPath.orbit(
-            gv.N3Tree.from_volume(gv.read_volume(small)).box, up="+z", fit=(32, 24)
+            gv.N3Tree.from_volume(gv.read_volume(small)).box, up="+z", fit_size=(32, 24)
         )
         volume = gv.read_volume(small)
         shader = gv.TransferFunction.preset("hot", *gv.window(volume))

@@ -12,6 +12,7 @@ from helpers import DEVICES
 from helpers.shading import CENTRE, RADIUS, SPACING, ball, grid, parallel, phong, sphere
 
 import gvtorch as gv
+from gvtorch.fields.fractals import Fractal, FractalSettings
 from gvtorch.ops.shading import IsosurfaceNumbers, LightKind, ShadeParameters
 from gvtorch.shaders.built_in import SurfaceSettings
 from gvtorch.shaders.lights import LightSettings, LitShader
@@ -302,11 +303,16 @@ def test_gradient_magnitude_scales_the_optical_depth_of_a_ramp(backend, share):
 
 
 @pytest.mark.parametrize(
-    ("kind", "settings"), [(LitShader, LightSettings), (gv.Isosurface, SurfaceSettings)]
+    ("kind", "settings"),
+    [
+        (LitShader, LightSettings),
+        (gv.Isosurface, SurfaceSettings),
+        (Fractal, FractalSettings),
+    ],
 )
-def test_keywords_that_shaders_pass_on_are_those_of_their_base(kind, settings):
+def test_keywords_that_classes_pass_on_are_those_of_their_base(kind, settings):
     hints = get_type_hints(kind.__init__)
     parameters = inspect.signature(kind.__init__).parameters.values()
     own = {p.name: hints[p.name] for p in parameters if p.kind is p.KEYWORD_ONLY}
-    inherited = {} if kind is LitShader else get_type_hints(LightSettings)
+    inherited = get_type_hints(LightSettings) if kind is gv.Isosurface else {}
     assert get_type_hints(settings) == own | inherited

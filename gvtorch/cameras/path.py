@@ -74,7 +74,7 @@ class CameraPath:
         elevation: float = 20.0,
         distance: float | None = None,
         up: Up = "+y",
-        fit: tuple[int, int] | None = None,
+        fit_size: tuple[int, int] | None = None,
     ) -> CameraPath:
         """Goes once around a box (2, 3); see `Camera.orbit` for the numbers.
 
@@ -83,8 +83,8 @@ class CameraPath:
             model: Name of the camera model.
             fov: Degrees; the model's default if left out.
             azimuth, elevation, distance, up: Of the start.
-            fit: (width, height) of pictures that show the whole box all the way around: finds the
-                distance, which stays the same.
+            fit_size: (width, height) of pictures that show the whole box all the way around: finds
+                the distance, which stays the same.
 
         Raises:
             ValueError: As `Camera.orbit`.
@@ -92,10 +92,12 @@ class CameraPath:
         context = "CameraPath.orbit"
         fov = model_of(context, model).fov if fov is None else fov
         azimuths = azimuth + torch.linspace(0, 360, 37)
-        if fit is not None:
+        if fit_size is not None:
             if distance is not None:
-                raise ValueError(f"{context}: fit finds the distance: leave it out, got {distance}")
-            fitted = Camera.orbit(azimuths, elevation, None, fov, *fit, model, up=up, fit=True)
+                raise ValueError(
+                    f"{context}: fit_size finds the distance: leave it out, got {distance}"
+                )
+            fitted = Camera.orbit(azimuths, elevation, None, fov, *fit_size, model, up=up, fit=True)
             farthest = (box.mean(0) - _eye_positions(fitted.placed(box))).norm(dim=1).amax()
             distance = float(farthest / (box[1] - box[0]).max())
         cameras = Camera.orbit(azimuths, elevation, distance, width=1, height=1, up=up).placed(box)

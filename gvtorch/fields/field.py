@@ -8,6 +8,7 @@ Source of the intervals: Moore, "Interval analysis", 1966; Snyder, "Interval ana
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Self
@@ -105,26 +106,37 @@ class Field(nn.Module):
         """Returns (2, 3) float64 corners of a box outside which there is nothing; None: unknown."""
         return None
 
-    def number(self, name: str, value: Any, **limits: Any) -> Tensor:
-        """Stores a number as a buffer `name`, () float64, and returns it; `limits` are those of
-        `check.number`.
+    def number(
+        self,
+        name: str,
+        value: Any,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        open_low: bool = False,
+    ) -> Tensor:
+        """Stores a number as a buffer `name`, () float64, and returns it.
 
         Multiplying with a () float64 tensor does not change the dtype of the other factor.
 
         Raises:
-            ValueError: It is not finite, or beyond its limits.
+            ValueError: It is not finite, not in [low, high], or is `low` and `open_low` is set.
         """
-        number = check.number(type(self).__name__, name, value, **limits)
+        context = type(self).__name__
+        number = check.number(context, name, value, low=low, high=high, open_low=open_low)
         return self._register(name, number)
 
-    def vector(self, name: str, value: Sequence[float] | Tensor, **limits: Any) -> Tensor:
+    def vector(
+        self, name: str, value: Sequence[float] | Tensor, *, positive: bool = False
+    ) -> Tensor:
         """Stores x, y, z as a buffer `name`, (3,) float64, and returns it. Convert it with
         `.to(points)` before use.
 
         Raises:
-            ValueError: They are not three finite numbers, or beyond their limits.
+            ValueError: They are not three finite numbers, or not positive if `positive` is set.
         """
-        return self._register(name, check.triple(type(self).__name__, name, value, **limits))
+        triple = check.triple(type(self).__name__, name, value, positive=positive)
+        return self._register(name, triple)
 
     def _register(self, name: str, value: Any) -> Tensor:
         buffer = torch.tensor(value, dtype=torch.float64)

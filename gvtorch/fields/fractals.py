@@ -18,6 +18,7 @@ Sources: those of ops/reference/orbits.py, which follows the orbits; Pickover, "
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypedDict, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -89,6 +90,20 @@ class Fold(Iteration):
 
     def ranges(self, z: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return twin.fold_ranges(z, reach, self.scale)
+
+
+class OrbitSettings(TypedDict, total=False):
+    """The keyword arguments of `Fractal` but `constant`, for constructors that pass them on."""
+
+    iterations: int
+    bailout: float
+    colors: Sequence[Color]
+
+
+class FractalSettings(OrbitSettings, total=False):
+    """All keyword arguments of `Fractal`."""
+
+    constant: Sequence[float] | None
 
 
 class Fractal(Distance):
@@ -206,9 +221,9 @@ class Fractal(Distance):
 class Mandelbulb(Fractal):
     """z^n + c in three dimensions: White and Nylander's bulb."""
 
-    def __init__(self, power: int = 8, **settings: object) -> None:
+    def __init__(self, power: int = 8, **settings: Unpack[FractalSettings]) -> None:
         """Takes n and the arguments of `Fractal`."""
-        super().__init__(Power(power), **settings)  # type: ignore[arg-type]
+        super().__init__(Power(power), **settings)
 
     def box(self) -> Tensor:
         """Returns a cube of half side 2^(1 / (n - 1)); beyond it |z|^n outgrows |c|: all escape."""
@@ -221,10 +236,13 @@ class Julia(Fractal):
     """z^n + a constant, in three dimensions."""
 
     def __init__(
-        self, constant: Sequence[float] = (-0.55, 0.3, -0.25), power: int = 2, **settings: object
+        self,
+        constant: Sequence[float] = (-0.55, 0.3, -0.25),
+        power: int = 2,
+        **settings: Unpack[OrbitSettings],
     ) -> None:
         """Takes the constant, n, and the arguments of `Fractal`."""
-        super().__init__(Power(power), constant=constant, **settings)  # type: ignore[arg-type]
+        super().__init__(Power(power), constant=constant, **settings)
 
     def box(self) -> Tensor:
         """Returns a cube of half side R >= 1 with R^n - |c| > R: all points beyond R escape."""
@@ -239,12 +257,11 @@ class Julia(Fractal):
 class Mandelbox(Fractal):
     """Lowe's box: each step folds, inverts, scales and translates."""
 
-    def __init__(self, scale: float = 2.0, **settings: object) -> None:
+    def __init__(self, scale: float = 2.0, **settings: Unpack[FractalSettings]) -> None:
         """Takes the scale, below -1 or above 1, and the arguments of `Fractal`."""
         step = Fold(scale)
-        # Corners are sqrt(3) = 1.73 `side` away.
-        arguments = {"bailout": 1.8 * step.side, **settings}
-        super().__init__(step, **arguments)  # type: ignore[arg-type]
+        settings.setdefault("bailout", 1.8 * step.side)  # corners are sqrt(3) = 1.73 `side` away
+        super().__init__(step, **settings)
         self._side = step.side + 2 * float(self.bailout) / abs(step.scale) ** self.iterations
 
     def box(self) -> Tensor:

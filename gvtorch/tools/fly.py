@@ -366,7 +366,7 @@ class Fly:
             elevation=elevation,
             distance=distance,
             up=look.up_direction() or up_and_front(scene.info.space)[0],
-            fit=(width, height) if distance is None else None,
+            fit_size=(width, height) if distance is None else None,
         )
 
 
