@@ -114,6 +114,7 @@ def others(small, tmp_path):
     np.save(tmp_path / "v.npy", gv.read_volume(small).data[..., 0].numpy())
     (tmp_path / "s.json").write_text('{"component": 0, "camera": {"eye": [9, 9, 9]}}')
     ViewState(shader=gv.TransferFunction.preset("hot", 0, 200)).save(tmp_path / "t.json")
+    (tmp_path / "fourth.json").write_text('{"component": 3}')
     (tmp_path / "list.json").write_text("[]")
     (tmp_path / "sky.exr").touch()
     (tmp_path / "stack").mkdir()
@@ -147,6 +148,9 @@ def others(small, tmp_path):
         ("render v.npy -o a.png --state list.json", "list.json: not a state"),
         ("fly v.npy -o f --state list.json", "list.json: not a state"),
         ("view v.npy --state list.json", "list.json: not a state"),
+        ("render v.npy -o a.png --state fourth.json", "fourth.json: component 3: a voxel has one"),
+        ("fly v.npy -o f --frames 2 --state fourth.json", "fourth.json: component 3: a voxel"),
+        ("view v.npy --no-browser --state fourth.json", "state: component 3: a voxel has one"),
         ("render v.npy -o sky.exr --background sky.exr", "written over what --background reads"),
         ("view v.npy --state s.json --camera orbit:0,0", "--state sets what --camera sets"),
         ("render v.npy -o a.png --state s.json --camera orbit:0,0", "--state sets what --camera"),

@@ -86,6 +86,18 @@ class ImageInfo:
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", tuple(self.channels))
 
+    def check_component(self, name: str, component: int, width: int) -> None:
+        """Raises ValueError, which lists the components, unless the `width` numbers of a voxel
+        have this one; `name` is what chose it.
+        """
+        if 0 <= component < width:
+            return
+        names = [channel.name for channel in self.channels]
+        names += [""] * (width - len(names))
+        listing = ", ".join(f"{n} ({name})" if name else str(n) for n, name in enumerate(names))
+        count = "one number" if width == 1 else f"{width} numbers"
+        raise ValueError(f"{name} {component}: a voxel has {count}: {listing}")
+
     def describe(self) -> dict[str, Any]:
         """Returns what is known as plain values."""
         info: dict[str, Any] = {"unit": self.unit, "quantity": self.quantity, "space": self.space}

@@ -173,6 +173,9 @@ class Fly:
                 return replace(base_state, camera=eye), camera, scene.render(camera)
         else:
             flight = self._flight_from(base_state)
+            for _, state in flight.keys:
+                name = f"{self._state_file}: component"
+                scene.info.check_component(name, state.component, scene.data.width)
 
             def render_at(position: float) -> tuple[ViewState, Camera, Picture]:
                 state = flight.along(position)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from ..base.declared import declared_names, declared_texts
 from .common import given_flags, option, parse_numbers
 from .parse import (
-    check_component,
     parse_background,
     parse_channels,
     parse_clip,
@@ -238,7 +237,7 @@ class Look:
             raise ValueError("--shader colors is for stores of meshes: --channels color,normal")
         if self.shader == "labels" or (self.shader == "plain" and data.info.labels):
             self._refuse_flags("labels have colours of their own")
-            check_component(data, self.component)
+            data.info.check_component("--component", self.component, data.width)
             return Labels()
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
@@ -246,7 +245,7 @@ class Look:
             for flag, value in (("--tf", self.tf), ("--window", self.window)):
                 if value is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
-            check_component(data, self.component)
+            data.info.check_component("--component", self.component, data.width)
             return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
         _warn_of_other_channels(data, self.component)
         transfer = parse_transfer(self.tf, self.window, data, self.component)

@@ -20,18 +20,6 @@ _TRANSFER_SUFFIXES = (".json", ".vp", ".xml")  # of files of transfer functions
 _LIGHTING_FACTORS = ("shadows", "occlusion", "indirect", "reach")
 
 
-def check_component(data: Volume | Store, component: int) -> None:
-    """Raises ValueError, which lists the components, if voxels have no such component."""
-    width = data.width
-    if 0 <= component < width:
-        return
-    names = [channel.name for channel in data.info.channels]
-    names += [""] * (width - len(names))
-    listing = ", ".join(f"{n} ({name})" if name else str(n) for n, name in enumerate(names))
-    count = "one number" if width == 1 else f"{width} numbers"
-    raise ValueError(f"--component {component}: a voxel has {count}: {listing}")
-
-
 def parse_transfer(
     name: str | None,
     window_text: str | None,
@@ -48,7 +36,7 @@ def parse_transfer(
     from ..shaders import TransferFunction
     from ..shaders.presets import CT_PRESETS, IN_HU
 
-    check_component(data, component)
+    data.info.check_component("--component", component, data.width)
     name = name or "gray"
     file, _, preset = name.rpartition(":")
     if Path(name).is_file() or name.endswith(_TRANSFER_SUFFIXES):
@@ -74,7 +62,7 @@ def parse_window(
     """Returns the values of LO,HI, P%,P%, `auto` or `full`; for `background` see `window`."""
     from ..io.window import value_range, window
 
-    check_component(data, component)
+    data.info.check_component("--component", component, data.width)
     if text == "auto":
         return window(data, component=component, background=background)
     if text == "full":

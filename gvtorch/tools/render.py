@@ -99,6 +99,8 @@ class Render:
                 state = replace(state, develop=development, show=self.show)
             else:
                 state = state.read(self.state)
+                name = f"{self.state}: component"
+                scene.info.check_component(name, state.component, scene.data.width)
             stats = self._write_picture(scene, state, bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": scene.data.extent}

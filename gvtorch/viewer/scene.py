@@ -208,8 +208,11 @@ class Scene:
         colors = Labels()(first)[:, :3].round(4)
         return {"names": first.tolist(), "colors": colors.tolist(), "count": len(names)}
 
-    def check_time(self, time: float) -> None:
-        """Raises ValueError where there is no such time."""
+    def check_state(self, state: ViewState) -> None:
+        """Raises ValueError where there is no such time, or no such component."""
+        time = state.time
+        if self.data is not None:
+            self.data.info.check_component("state: component", state.component, self.data.width)
         if self.times > 1:
             if time != int(time) or not 0 <= time < self.times:
                 raise ValueError(

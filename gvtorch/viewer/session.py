@@ -357,7 +357,7 @@ class Session:
             state, left_out = trimmed(state)
             for reason in left_out:
                 client.send_message("note", text=f"left out: {reason}")
-        self.scene.check_time(state.time)
+        self.scene.check_state(state)
         self._open_planes(state)
         before, self.state = self.state, state
         self._broadcast_state(client if not message.rest else None)

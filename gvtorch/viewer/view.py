@@ -176,7 +176,7 @@ def new_session(
             else:
                 eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)
-        scene.check_time(chosen.time)
+        scene.check_state(chosen)
         if chosen.time != scene.time and scene.reopen is not None:
             scene.show_time(chosen.time, scene.reopen(int(chosen.time)))
         elif chosen.time != scene.time:
