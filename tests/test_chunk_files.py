@@ -19,7 +19,7 @@ from helpers.stores import noise, serving
 import gvtorch as gv
 from gvtorch.io import http, relay
 from gvtorch.io.stores.chunk_files import METADATA_FILES, ChunkFiles, begin_read
-from gvtorch.io.stores.store_layout import kvstore, opened_at
+from gvtorch.io.stores.tensorstores import kvstore, opened_at
 
 ts = pytest.importorskip("tensorstore")
 

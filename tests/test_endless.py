@@ -260,7 +260,7 @@ def test_a_server_that_sends_all_of_a_file_and_breaks_off_within_the_part_is_tol
 def test_buckets_are_read_within_bounds(tmp_path, data, how, monkeypatch):
     import tensorstore as ts
 
-    from gvtorch.io.stores.store_layout import context
+    from gvtorch.io.stores.tensorstores import context
 
     stalls = pytest.MonkeyPatch()
     sharded, url = how == "index", f"memory://endless-{how}/"
@@ -381,7 +381,7 @@ def test_nobody_else_reads_by_the_relay(server, tmp_path):
 def test_the_relay_answers_every_range(server, tmp_path, kind):
     import tensorstore as ts
 
-    from gvtorch.io.stores.store_layout import context
+    from gvtorch.io.stores.tensorstores import context
 
     content, url = bytes(range(256)) * 4, f"{server.url}/"
     if kind == "bucket":

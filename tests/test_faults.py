@@ -29,7 +29,8 @@ from gvtorch.io.stores.block_reader import BlockReader
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.level_reader import StoredArray
 from gvtorch.io.stores.store import Store
-from gvtorch.io.stores.store_layout import WORK, Deadline
+from gvtorch.io.stores.store_layout import WORK
+from gvtorch.io.stores.tensorstores import Deadline
 
 VIEW = gv.Camera.orbit(width=24, height=16)
 

@@ -433,7 +433,7 @@ def test_reads_end_in_time(served):
 
 
 def test_stores_in_memory_open_too():
-    from gvtorch.io.stores.store_layout import context
+    from gvtorch.io.stores.tensorstores import context
 
     root = ts.KvStore.open("memory://gvtorch-test/", context=context()).result()
     image = {"axes": ["z", "y", "x"], "datasets": [{"path": "0"}]}

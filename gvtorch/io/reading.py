@@ -26,7 +26,8 @@ from .remote import fetch, is_file_url
 from .resources import check_memory
 from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
 from .stores.ngff import is_zarr
-from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES, StoreError
+from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES
+from .stores.tensorstores import StoreError
 
 _MAX_CHANNELS = 2**10
 

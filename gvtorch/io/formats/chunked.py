@@ -22,7 +22,8 @@ from ...base.units import spacing_of
 from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
-from ..stores.store_layout import Deadline, is_number, kvstore, opened_at
+from ..stores.store_layout import is_number
+from ..stores.tensorstores import Deadline, kvstore, opened_at
 from .format import Format, not_chosen
 
 _READ_TIMEOUT = 600.0  # seconds for one read

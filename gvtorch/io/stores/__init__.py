@@ -2,6 +2,7 @@
 
     store.py         `Store`: reads gvtorch's stores and any other OME-Zarr image, block by block
     store_layout.py  the layout of a store on disk
+    tensorstores.py  tensorstore's settings, deadlines, files and arrays
     conversion.py    `convert`, `estimate`: any volume to a store; conversion_plan.py: its cost
     unfinished.py    a store that is being written: lock, journal, the last step
     shard.py         one task of the converter

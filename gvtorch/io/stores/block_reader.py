@@ -17,7 +17,13 @@ from ...base.boxes import Zyx, group_rows
 from .checksums import Checksums, shard_path
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .level_reader import LevelReader
-from .store_layout import BORDER, CELL, Deadline, StoreError, StoreLayout, begin_open, read_key
+from .store_layout import BORDER, CELL, StoreLayout
+from .tensorstores import (
+    Deadline,
+    StoreError,
+    begin_open,
+    read_key,
+)
 
 _BATCH_BLOCKS = 256  # blocks read at once; larger batches only cost memory traffic
 _BLOCKS_AHEAD = 2 * _BATCH_BLOCKS  # blocks being read at a time

@@ -20,7 +20,8 @@ from . import unfinished
 from .conversion import convert
 from .ngff import CHANNELS_ATTRIBUTE, read_json, read_json_file
 from .store import Store
-from .store_layout import WORK, Deadline, is_name, kvstore
+from .store_layout import WORK, is_name
+from .tensorstores import Deadline, kvstore
 
 _TIMEOUT = 20.0  # seconds
 _MANIFEST = "channels.json"

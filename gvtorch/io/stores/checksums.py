@@ -20,7 +20,8 @@ import numpy as np
 
 from .chunk_files import file_limit, index_bytes
 from .ngff import read_json
-from .store_layout import Deadline, StoreError, StoreLayout, read_key
+from .store_layout import StoreLayout
+from .tensorstores import Deadline, StoreError, read_key
 
 CHECKSUMS_FILE = "gvtorch/checksums.json"
 _MAX_LINE_BYTES = 128  # bytes of a file's line in the list, at most

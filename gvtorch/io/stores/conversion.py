@@ -40,7 +40,8 @@ from .conversion_plan import (
     source_of,
 )
 from .store import Store
-from .store_layout import RESUME_ADVICE, WORK, Deadline, begin_open
+from .store_layout import RESUME_ADVICE, WORK
+from .tensorstores import Deadline, begin_open
 
 _TASKS_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
 _OPEN_TIMEOUT = 60.0  # seconds

@@ -25,7 +25,8 @@ from ..reading import FormatSettings, open_source, read_time_points, with_placem
 from ..source import MemorySource, VolumeSource, no_time_message
 from . import shard, unfinished
 from .level_reader import Pool
-from .store_layout import BLOCKS, DTYPES, StoreLayout, context, kvstore
+from .store_layout import BLOCKS, DTYPES, StoreLayout
+from .tensorstores import context, kvstore
 
 _FEW_TASKS = 4  # up to this many tasks of level 0, starting processes does not pay
 _PROCESS_BYTES = 400 << 20  # bytes of a worker process without data

@@ -23,11 +23,10 @@ from ...base.labels import check_narrowed
 from ..source import no_time_message
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
-from .store_layout import (
-    MAX_STORE_VOXELS,
+from .store_layout import MAX_STORE_VOXELS, StoreLayout
+from .tensorstores import (
     Deadline,
     StoreError,
-    StoreLayout,
     begin_open,
     child,
     one_line_error,

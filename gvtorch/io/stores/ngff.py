@@ -21,13 +21,15 @@ from ..remote import is_file_url
 from .store_layout import (
     JOURNAL,
     MANIFEST,
-    MAX_JSON_BYTES,
     RESUME_ADVICE,
     WORK,
-    Deadline,
     StoreLayout,
-    child,
     is_number,
+)
+from .tensorstores import (
+    MAX_JSON_BYTES,
+    Deadline,
+    child,
     read_key,
 )
 

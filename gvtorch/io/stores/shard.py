@@ -25,9 +25,11 @@ from .store_layout import (
     BORDER,
     CELL,
     RESUME_ADVICE,
+    StoreLayout,
+)
+from .tensorstores import (
     Deadline,
     StoreError,
-    StoreLayout,
     begin_open,
     one_line_error,
 )

@@ -29,12 +29,14 @@ from .store_layout import (
     CELL,
     DTYPES,
     CoarseChannel,
-    Deadline,
     StoreLayout,
+    value_dtype,
+)
+from .tensorstores import (
+    Deadline,
     begin_open,
     child,
     kvstore,
-    value_dtype,
 )
 
 _OPEN_TIMEOUT = 20.0  # seconds

@@ -1,4 +1,4 @@
-"""The layout of a store on disk; and tensorstore: its settings, and waiting for its results.
+"""The layout of a store on disk.
 
     STORE.zarr/zarr.json             metadata; written last, so a store that has it is complete
     STORE.zarr/0, 1, ...             (z, y, x) or (c, z, y, x), the mean pyramid, 0 the finest;
@@ -20,24 +20,14 @@ writes them. For labels, coarse voxels hold the most frequent, cells the smalles
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
-import os
 import re
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from reprlib import repr as brief
 from typing import TYPE_CHECKING, Any
-from urllib.parse import unquote, urlsplit
-
-from ...base.whole_file import text_path
-from ..http import Endless, file_url, is_http, read_http
-from ..relay import read_within, relay_folder, with_urls
-from ..resources import cores
 
 if TYPE_CHECKING:
     import numpy as np  # not at run time: `gvtorch --help` imports this module
@@ -51,14 +41,13 @@ MANIFEST, JOURNAL = "manifest.json", "journal.jsonl"  # in it, of one store
 RESUME_ADVICE = "the same command with --resume (in Python: resume=True) goes on"
 MAX_STORE_VOXELS = 2**40
 MAX_TIMES = 2**20
-MAX_JSON_BYTES = 1 << 24  # of metadata
 DTYPES = {"uint8": 1, "int8": 1, "uint16": 2, "int16": 2, "float16": 2, "float32": 4}  # bytes
 GROUPS = ("gvtorch", "gvtorch/blocks", "gvtorch/cells")
 _PYRAMID_CHUNK = 64  # voxels
 _CELL_CHUNK = 16  # cells
 _LABEL_CHUNK = 2**16
 _COARSE_SHARD = 128  # voxels along a side of a shard of a coarse channel
-_WRITE_ZEROS = "store_data_equal_to_fill_value"  # zeros, too: a missing chunk is an error
+WRITE_ZEROS = "store_data_equal_to_fill_value"  # zeros, too: a missing chunk is an error
 
 
 def value_dtype(stored: np.dtype, *, labels: bool = False) -> str:
@@ -248,7 +237,7 @@ class StoreLayout:
         }
         if dimension_names:
             metadata["dimension_names"] = list(dimension_names)
-        return {"path": path, "driver": "zarr3", "metadata": metadata, _WRITE_ZEROS: write_zeros}
+        return {"path": path, "driver": "zarr3", "metadata": metadata, WRITE_ZEROS: write_zeros}
 
     def attributes(self, placement: dict[str, Any]) -> dict[str, Any]:
         """Returns the metadata of a complete store; `placement` is its spacing and origin."""
@@ -382,188 +371,3 @@ def _is_list(value: Any, size: Any) -> bool:
 
 def _is_whole(value: Any, low: int, high: int) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
-
-
-# --- tensorstore
-
-
-class StoreError(OSError):
-    """A store could not be read or written."""
-
-
-class Deadline:
-    """The time at which reads are abandoned: `timeout` seconds after this is created."""
-
-    def __init__(self, timeout: float) -> None:
-        check_process()
-        self.timeout = timeout
-        self._end = time.monotonic() + timeout
-
-    @property
-    def left(self) -> float:
-        """Seconds until then."""
-        return max(0.0, self._end - time.monotonic())
-
-    def timeout_error(self, context: str) -> TimeoutError:
-        """Returns the error of a read that took too long."""
-        return TimeoutError(f"{context}: no answer within {self.timeout:g} s")
-
-    def wait(self, future: Any, context: str) -> Any:
-        """Returns the result of one of tensorstore's futures; raises TimeoutError if it took too
-        long, StoreError if it failed.
-        """
-        try:
-            return future.result(timeout=self.left)
-        except TimeoutError:
-            future.cancel()
-            raise self.timeout_error(context) from None
-        except Exception as error:  # tensorstore raises exceptions of several types
-            raise StoreError(f"{context}: {one_line_error(error)}") from None
-
-
-def one_line_error(error: BaseException) -> str:
-    """Returns tensorstore's message in one line, without its annotations."""
-    text = re.sub(r"\s*\[[a-z_]+(=| locations=).*", "", str(error), flags=re.DOTALL)
-    return with_urls(" ".join(text.split()))[:400] or type(error).__name__
-
-
-_user_pids: set[int] = set()  # processes that used tensorstore: this one, or one it was forked from
-
-
-def check_process() -> None:
-    """Raises StoreError in a process that was forked after tensorstore was used: it has lost
-    tensorstore's threads, and would crash.
-    """
-    if _user_pids - {os.getpid()}:
-        raise StoreError(
-            "stores can't be read in a process that was forked after one was opened: open the "
-            "first one in the workers, or start these by 'spawn' or 'forkserver' "
-            "(DataLoader(multiprocessing_context='forkserver'))"
-        )
-
-
-@functools.cache
-def context() -> Any:
-    """Returns tensorstore's context: few threads, no cache (pools and host cache replace it)."""
-    import tensorstore as ts
-
-    _user_pids.add(os.getpid())
-    return ts.Context(
-        {
-            "cache_pool": {"total_bytes_limit": 0},
-            "data_copy_concurrency": {"limit": min(8, cores())},
-            "file_io_concurrency": {"limit": min(16, 2 * cores())},
-            "http_request_concurrency": {"limit": 16},
-        }
-    )
-
-
-def kvstore(location: str | Path) -> Any:
-    """Returns tensorstore's spec of a folder, given as a path, or as a URL that tensorstore knows.
-    Links and ".." in a path are resolved as the operating system does; a path that tensorstore
-    can't take, such as one that is not UTF-8, is replaced by a link to it (`text_path`).
-    """
-    text = str(location)
-    if text.startswith("file://"):
-        text = unquote(urlsplit(text).path)
-    if re.match(r"[a-z0-9+]{2,}://", text):
-        return text if text.endswith("/") or "?" in text else text + "/"
-    path = text_path(os.path.realpath(text))
-    return {"driver": "file", "path": f"{path.rstrip('/')}/"}
-
-
-def child(root: Any, path: str) -> Any:
-    """Returns the spec of a folder inside a folder."""
-    if isinstance(root, str):
-        return file_url(root, f"{path}/")
-    return {**root, "path": f"{root.get('path', '')}{path}/"}
-
-
-def read_key(
-    location: str,
-    root: Any,
-    name: str,
-    deadline: Deadline,
-    byte_range: slice | None = None,
-    max_bytes: int = MAX_JSON_BYTES,
-) -> Any:
-    """Returns the content of a file in a folder, or a part of its bytes, which may count from its
-    end; None if there is no such file. A file of more than `max_bytes` is a StoreError. Raises as
-    `Deadline.wait`, and ValueError if there can be no such folder.
-    """
-    import tensorstore as ts
-
-    if isinstance(root, dict):
-        from .chunk_files import check_file
-
-        try:
-            check_file(f"{root['path']}{name}", max_bytes)
-        except Endless as error:
-            raise StoreError(f"{location}/{name}: {error}") from None
-    if is_http(root):
-        url, size = file_url(root, name), max_bytes
-        if byte_range is not None:
-            size = (
-                byte_range.stop - (byte_range.start or 0)
-                if byte_range.stop is not None
-                else -byte_range.start
-            )
-        try:
-            return read_http(
-                url,
-                min(size, max_bytes),
-                byte_range,
-                max_file_bytes=max_bytes,
-                seconds=deadline.left,
-            )
-        except TimeoutError:
-            raise deadline.timeout_error(f"{location}/{name}") from None
-        except OSError as error:
-            raise StoreError(f"{location}/{name}: {one_line_error(error)}") from None
-    try:
-        folder = deadline.wait(ts.KvStore.open(root, context=context()), location)
-    except StoreError as error:
-        raise ValueError(f"{location}: not a store: {error}") from None
-    try:
-        return read_within(
-            folder,
-            name,
-            byte_range,
-            max_bytes,
-            lambda future: deadline.wait(future, f"{location}/{name}"),
-        )
-    except Endless as error:
-        raise StoreError(f"{location}/{name}: {error}") from None
-
-
-def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
-    """Starts opening an array of a store; returns tensorstore's future.
-
-    `root` comes from `kvstore`, `spec` from `StoreLayout`; `mode` is "read", "write" or "create"
-    (unless it exists).
-    """
-    omitted = {"read": ("path", "metadata", _WRITE_ZEROS), "write": ("path", "metadata")}
-    array_spec = {
-        key: value for key, value in spec.items() if key not in omitted.get(mode, ("path",))
-    }
-    return opened_at(child(root, spec["path"]), array_spec, create=mode == "create")
-
-
-def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any:
-    """Starts opening the array in a folder; returns tensorstore's future."""
-    import tensorstore as ts
-
-    relayed = relay_folder(folder, context()) if isinstance(folder, str) else None
-    if relayed is None:
-        from .chunk_files import METADATA_FILES, check_file, failed_future
-
-        for name in METADATA_FILES:
-            try:
-                check_file(f"{folder['path']}{name}", MAX_JSON_BYTES)
-            except Endless as error:
-                return failed_future(Endless(f"{name}: {error}"))
-    array_spec = {**spec, "kvstore": relayed.spec if relayed else folder}
-    future = ts.open(array_spec, context=context(), open=True, create=create)
-    if relayed:
-        relayed.future = future
-    return future
