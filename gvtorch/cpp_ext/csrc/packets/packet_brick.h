@@ -11,7 +11,7 @@ struct PacketBrick {
   Vec3<Floats> offset, slope;
   Floats constant;
   Mask stored;
-  Ints brick;  // its slot, or its first byte in the pool: what `first_of` of the values returns
+  Ints brick;  // its slot, or its first byte in the pool: see TypedValues
 
   // True where the brick is in one of the first `count` slots; only if `brick` holds slots.
   GV_HD Mask in_first_slots(int32_t count) const { return stored & (brick < count); }
@@ -194,20 +194,18 @@ struct PacketChannel : ChannelView {
   }
 };
 
-// The shader's values: of a dtype known to the compiler, or only at run time.
-template <class KnownVoxel, bool kLongOffsets>
+// The shader's values: of a dtype known to the compiler, in a pool of less than 2 GiB, or of one known only at run
+// time. `slot_bytes` is what a slot is multiplied by to give PacketBrick::brick.
+template <class KnownVoxel>
 struct TypedValues {
   using Voxel = KnownVoxel;
   const PacketPool pool;
 
   TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
       : pool(channel.bricks_bzyxc, channel.type, side, channel.width, component) {}
-  GV_HD Ints first_of(Ints brick) const {  // lanes without a brick may hold anything, so the product must wrap
-    return kLongOffsets ? brick
-                        : reinterpret_cast<Ints>(reinterpret_cast<UInts>(brick) * static_cast<uint32_t>(pool.stride));
-  }
+  int32_t slot_bytes() const { return static_cast<int32_t>(pool.stride); }
   GV_HD Floats read(Ints brick, const Vec3<Floats>& position) const {
-    return trilinear<Voxel, kLongOffsets>(pool, brick, position);
+    return trilinear<Voxel, false>(pool, brick, position);
   }
 };
 struct AnyValues {
@@ -217,7 +215,7 @@ struct AnyValues {
 
   AnyValues(const ChannelView& channel, int32_t side, int32_t component, int64_t bricks)
       : channel(channel, side, bricks), component(component) {}
-  GV_HD Ints first_of(Ints brick) const { return brick; }
+  int32_t slot_bytes() const { return 1; }
   GV_HD Floats read(Ints brick, const Vec3<Floats>& position) const { return channel.read(component, brick, position); }
   GV_HD Vec3<Floats> rise(Ints brick, const Vec3<Floats>& position) const {
     return channel.rise(component, brick, position);

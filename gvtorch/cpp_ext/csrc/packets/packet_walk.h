@@ -1,15 +1,14 @@
 // Traces kLanes rays at once with any shader of shaders.h, in float32; each lane is in its own node and interval. A
 // lane computes what its ray computes alone, so every bit is the same.
 //
-// This is a second walk next to that of walk.h, for two reasons. Lanes keep the path of their last descent, and the
-// next descent continues where it departs from that path; a GPU's threads would keep it in local memory, which takes
-// twice as long as to restart from the root. And lanes whose run of intervals has ended wait while the others march on
-// together, until too few are left. Rare cases (the cut interval at the far side, the pool's last brick, a request) are
-// handled lane by lane, by the functions for a single ray.
+// This and packet_path.h are a second walk next to that of walk.h, for two reasons. Lanes keep the path of their last
+// descent, and the next descent continues where it departs from that path; a GPU's threads would keep it in local
+// memory, which takes twice as long as to restart from the root. And lanes whose run of intervals has ended wait while
+// the others march on together, until too few are left. Rare cases (the cut interval at the far side, the pool's last
+// brick, a request) are handled lane by lane, by the functions for a single ray.
 #pragma once
 
-#include "packets/deep_lanes.h"
-#include "packets/packet_brick.h"
+#include "packets/packet_path.h"
 #include "shaders/shade_rays.h"
 
 namespace gvtorch::GV_NAMESPACE {
@@ -36,68 +35,43 @@ struct PacketChannels {
 
 // The walk of a packet, and the probe (see probe.h) of its lanes that march. Values: TypedValues or AnyValues.
 template <class Shader, class Values>
-struct PacketWalk {
+struct PacketWalk : PacketPath {
   using Number = Floats;
   using Kernel = ShadeRay<float, Shader, BitDigits, false, typename Values::Voxel>;
   using RayProbe = typename Kernel::RayProbe;
   using Sum = typename Shader::Sum;
   static constexpr bool kEnds = Shader::kEnds;
-  static constexpr bool kKeepsPath = Kernel::kHidesAlike;  // else hidden nodes differ from ray to ray
 
   const Kernel& kernel;
-  const Walk<float>& walk;
   const Shader& shader;
   const Values values;
   const PacketChannels channels;
-  uint8_t* const hidden_tn;
   const int64_t bricks;
   const float stop_clear;
-  const int32_t frame;
 
-  // Rays.
-  int64_t numbers[kLanes];
-  Ray<Floats> ray;
-  Sight<Floats> sight;
-  Intervals<Floats> intervals;
   Mask alive;
-  Ints wanted;
   typename Shader::template SumOf<Floats> sum;
   Ints samples;
-
-  // The last descent: the node of each level, negative (bit 31 is set) where it is hidden.
-  Vec3<Ints> cell{};
-  DeepLanes deep_lanes;  // in place of `cell` where the tree is deep
-  Ints path_depth = Ints{} - 1;
-  Ints path_node[kMaxLevels], path_brick[kMaxLevels], path_tile[kMaxLevels];
 
   // The run of intervals that a lane is in.
   Mask marching;  // lanes whose values are read
   Ints remaining;
-  Floats number;
-  Extent<Floats> extent;
-  Floats voxel, blend_scale;
   Floats last_value;  // value at the end of the last interval
-  Mask mixed;
-  PacketBrick fine, coarse;
-  Ints fine_depth, coarse_depth;
 
-  PacketWalk(const Kernel& kernel, const ShadeArgs& args)
-      : kernel(kernel),
-        walk(kernel),
+  PacketWalk(const Kernel& kernel, const Values& values, const ShadeArgs& args)
+      : PacketPath(kernel, kernel.channels, Kernel::kHidesAlike ? args.hidden_tn : nullptr, values.slot_bytes()),
+        kernel(kernel),
         shader(kernel.shader),
-        values(kernel.channels.value, args.side, args.component, args.bricks),
+        values(values),
         channels{{kernel.channels.value, args.side, args.bricks},
                  {kernel.channels.normal, args.side, args.bricks},
                  {kernel.channels.other, args.side, args.bricks}},
-        hidden_tn(args.hidden_tn),
         bricks(args.bricks),
-        stop_clear(kernel.stop_clear),
-        frame(*kernel.frame_1),
-        deep_lanes(walk.rays, walk.tree, walk.levels) {}
+        stop_clear(kernel.stop_clear) {}
 
   // Traces the rays at positions begin to end of the order, at most kLanes.
   GV_HD void trace(int64_t begin, int64_t end) {
-    load(begin, end);
+    begin_rays(begin, end);
     while (any(alive)) {
       const Mask waiting = alive & (remaining == 0);
       if (any(waiting)) advance(waiting);
@@ -170,37 +144,16 @@ struct PacketWalk {
  private:
   using Visitor = typename Kernel::template Visitor<Shader>;
 
-  GV_HD void load(int64_t begin, int64_t end) {
-    alive = Mask{};
-    remaining = wanted = samples = mixed = fine_depth = coarse_depth = Ints{};
-    number = voxel = blend_scale = last_value = Floats{};
-    extent = Extent<Floats>{};
+  GV_HD void begin_rays(int64_t begin, int64_t end) {
+    alive = load(begin, end, kernel.lengths);
+    remaining = samples = Ints{};
+    last_value = Floats{};
     sum = {};
-    fine = coarse = PacketBrick{};
-    ray = Ray<Floats>{};
-    intervals = Intervals<Floats>{};
-    intervals.step = walk.step;
-    intervals.top = kernel.lengths - 1;
-    intervals.length = broadcast<Floats>(intervals.step);
-    intervals.inverse_length = 1.0f / intervals.length;
-    for (int axis = 0; axis < 3; ++axis) ray.upper_bound[axis] = Ray<Floats>::upper_bound_of(walk.rays, axis);
-    for (int lane = 0; lane < kLanes; ++lane) {
-      numbers[lane] = begin + lane < end ? walk.order(begin + lane) : -1;
-      if (numbers[lane] < 0) continue;
-      const Ray<float> lane_ray(walk.rays, numbers[lane]);
-      put_lane(ray, lane, lane_ray);
-      if (walk.rays.deep) deep_lanes.begin(lane, lane_ray);
-      put_lane(sight, lane, Sight<float>(walk.rays, numbers[lane], lane_ray.moved));
-      intervals.cone_near[lane] = lane_ray.cone_near;
-      intervals.cone_growth[lane] = lane_ray.cone_growth;
-      intervals.start[lane] = intervals.base[lane] = lane_ray.first;
-      intervals.stop[lane] = lane_ray.last;
+    for_lanes(alive, [&](int lane) {
       float* feature_c = kernel.features_rc + numbers[lane] * kernel.features;
       for (int32_t c = 0; c < kernel.features; ++c) feature_c[c] = 0;
       sum.begin(lane, static_cast<float>(walk.rays.clear(numbers[lane])), kernel.hit_clear, feature_c);
-      alive[lane] = -1;
-    }
-    intervals.choose_level(alive);
+    });
     alive = alive & intervals.inside() & (sum.clear > stop_clear);
   }
 
@@ -232,229 +185,39 @@ struct PacketWalk {
     alive = alive & ~(waiting & (remaining == 0) & ~(intervals.inside() & (sum.clear > stop_clear)));
   }
 
-  // The same as Walk::visit and Walk::find.
+  // The same as Walk::visit.
   GV_HD void visit(Mask mask) {
-    const TreeView& tree = walk.tree;
-    const Levels<float>& levels = walk.levels;
-    const Floats middle = intervals.middle();
-    const Floats cone = intervals.cone(middle);
-    for (;;) {
-      const Mask finer = mask & (wanted < tree.max_depth) & (pick(levels.voxel, wanted) > cone);
-      if (!any(finer)) break;
-      wanted = wanted - finer;
-    }
-    Floats voxel_above;
-    for (;;) {
-      voxel_above = pick(levels.voxel, larger(wanted - 1, Ints{}));
-      const Mask coarser = mask & (wanted > 0) & ~(voxel_above > cone);
-      if (!any(coarser)) break;
-      wanted = wanted + coarser;
-    }
-    voxel_above = wanted > 0 ? voxel_above : Floats{} + INFINITY;
-    const Floats wanted_voxel = pick(levels.voxel, wanted);
-    const Mask reached = wanted_voxel <= cone;
-    const Mask blend = reached & (wanted > 0);
-    extent.cone_low = mask ? (reached ? wanted_voxel : Floats{} - INFINITY) : extent.cone_low;
-    extent.cone_high = mask ? (reached ? voxel_above : wanted_voxel) : extent.cone_high;
-    voxel = mask ? wanted_voxel : voxel;
-    blend_scale = mask ? 1.0f / (voxel_above - wanted_voxel) : blend_scale;
-
-    Ints depth, node, brick, tile;
-    descend(mask, middle, depth, node, brick, tile);
-    const Mask hides = node < 0;
-    const Floats exit = ray.exit_distance([&](int axis, Mask upper) { return face(mask, axis, depth, upper); });
-    extent.exit = mask ? exit : extent.exit;
-
-    // The nodes whose bricks are read.
-    Ints fine_level = depth, fine_brick = brick;
-    for (;;) {
-      const Mask higher = mask & (fine_level > 0) & (fine_brick == kAbsent);
-      if (!any(higher)) break;
-      fine_level = fine_level + higher;
-      fine_brick = higher ? path_entry(path_brick, fine_level) : fine_brick;
-    }
-    Ints coarse_level = fine_level, coarse_brick = fine_brick;
-    const Mask blends = mask & blend;
-    if (any(blends)) {
-      for (;;) {
-        const Mask higher = blends & (coarse_level > 0) & ((coarse_level >= wanted) | (coarse_brick == kAbsent));
-        if (!any(higher)) break;
-        coarse_level = coarse_level + higher;
-        coarse_brick = higher ? path_entry(path_brick, coarse_level) : coarse_brick;
-      }
-      const Mask has_coarse = blends & (coarse_level < wanted) & (coarse_brick != kAbsent);
-      coarse_level = has_coarse ? coarse_level : fine_level;
-      coarse_brick = has_coarse ? coarse_brick : fine_brick;
-    }
-    const Mask skipped = hides & ((depth < wanted) | ~blend);
-    const Mask empty = Shader::kSeesEmpty ? Mask{} : (fine_brick == kEmpty) & (coarse_brick == kEmpty);
-    const Mask shows_nothing = mask & (skipped | (fine_brick == kAbsent) | empty);
-
-    const Mask seen = mask & ~skipped;
-    const Mask lacks =
-        seen & ((brick == kAbsent) | ((depth < wanted) & (tile == kAbsent)) |
-                (blend & (depth == wanted) & (path_entry(path_brick, larger(depth - 1, Ints{})) == kAbsent)));
-    if (any(lacks)) {
-      sum.missed = sum.missed | lacks;
-      for_lanes(lacks, [&](int lane) {
-        Descent descent;
-        descent.depth = depth[lane];
-        descent.node = node[lane] & INT32_MAX;
-        descent.parent = depth[lane] > 0 ? path_node[depth[lane] - 1][lane] & INT32_MAX : -1;
-        descent.brick = brick[lane];
-        descent.tile = tile[lane];
-        if (fine_brick[lane] != kAbsent) descent.fine.node = path_node[fine_level[lane]][lane] & INT32_MAX;
-        walk.mark_missing(descent, wanted[lane], blend[lane] != 0, cone[lane]);
-      });
-    }
-    stamp(walk.stamp_b, seen & (fine_brick >= 0), fine_brick);
-    stamp(walk.stamp_b, seen & (coarse_brick >= 0), coarse_brick);
-
-    Mask runs = mask & ~shows_nothing;
-    if (any(runs)) {
-      const Mask two_nodes = coarse_level != fine_level;
-      mixed = runs ? two_nodes : mixed;
-      fine_depth = runs ? fine_level : fine_depth;
-      coarse_depth = runs ? coarse_level : coarse_depth;
-      set_brick(runs, fine_level, fine_brick, fine);
-      const Mask both = runs & two_nodes;
-      if (any(both)) set_brick(both, coarse_level, coarse_brick, coarse);
-      Mask flat = runs & ~fine.stored & (~two_nodes | ~coarse.stored);
-      if (kernel.shades_each_position()) flat = Mask{};
-      each_lane(flat & two_nodes, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
-      runs = runs & ~flat;
+    const Found found = find_nodes(mask);
+    sum.missed = sum.missed | found.lacking;
+    if (any(found.shown)) {
+      Mask flat = kernel.shades_each_position() ? Mask{} : found.uniform;
+      each_lane(flat & mixed, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
+      const Mask runs = found.shown & ~flat;
       if (any(runs)) begin_run(runs);
       if (any(flat)) add_region(flat);
     }
-    leave(shows_nothing);
+    leave(found.nothing);
   }
-
-  // The same as `descend` in tree.h, level by level for all lanes; those whose path is known to a deeper level wait.
-  GV_HD void descend(Mask mask, Floats middle, Ints& depth, Ints& node, Ints& brick, Ints& tile) {
-    const TreeView& tree = walk.tree;
-    const Ints shared_depth = move_to(mask, middle, kKeepsPath ? smaller(path_depth, wanted) : Ints{} - 1);
-    const Ints from = larger(shared_depth, Ints{});
-    node = path_entry(path_node, from);
-    brick = path_entry(path_brick, from);
-    tile = path_entry(path_tile, from);
-    depth = shared_depth;
-    Mask going = mask & ((shared_depth < 0) | ~((shared_depth == wanted) | (tile < 0) | (node < 0)));
-    int32_t level = kMaxLevels;
-    for_lanes(going, [&](int lane) { level = smaller(level, shared_depth[lane] + 1); });
-    for (; any(going); ++level) {
-      const Mask active = going & (depth == level - 1);
-      Ints next_node = Ints{} + tree.root, home_tile = Ints{} + tree.root_tile;
-      if (level > 0) {
-        home_tile = active ? tile : Ints{};
-        next_node = home_tile * tree.nodes_per_tile + child(active, level);
-      }
-      next_node = active ? next_node : Ints{};
-      stamp(tree.stamp_t, active, home_tile);
-      const Ints brick_word = pick(tree.brick_tn, next_node), tile_word = pick(tree.child_tn, next_node);
-      const Ints next_brick = brick_word < tree.bricks ? brick_word : Ints{} + kAbsent;  // as TreeView::checked_word
-      const Ints next_tile = tile_word < tree.tiles ? tile_word : Ints{} + kAbsent;
-      const Mask hides = hidden(active, next_node);
-      node = active ? next_node | (hides & INT32_MIN) : node;
-      brick = active ? next_brick : brick;
-      tile = active ? next_tile : tile;
-      path_node[level] = active ? node : path_node[level];
-      path_brick[level] = active ? brick : path_brick[level];
-      path_tile[level] = active ? tile : path_tile[level];
-      depth = depth - active;
-      going = going & ~(active & ((level == wanted) | (tile < 0) | hides));
-    }
-    path_depth = mask ? depth : path_depth;
-  }
-
-  // `move_to` moves lanes to their positions at distance t; it returns the deepest level, at most `deepest`, at which a
-  // lane is in the same node as before. `child` and `face` are those of Digits and BitDigits: which child of the node
-  // above a lane is in, and the offset of a face of its node from its ray's origin.
-  GV_HD Ints move_to(Mask mask, Floats t, Ints deepest) {
-    if (walk.rays.deep) return deep_lanes.move_to(mask, ray.direction, t, deepest);
-    const TreeView& tree = walk.tree;
-    const int32_t top = tree.digit_bits * tree.max_depth;
-    const float cells = static_cast<float>(1 << top);
-    Ints changed_bits{};
-    const Vec3<Floats> position = ray.at(t);
-    for (int axis = 0; axis < 3; ++axis) {
-      const Ints new_cell = mask ? truncated(position[axis] * cells) : cell[axis];
-      changed_bits = changed_bits | (cell[axis] ^ new_cell);
-      cell[axis] = new_cell;
-    }
-    // A float's exponent gives the highest bit set. Rounding up to a power of two may make the result one level less.
-    const Ints high = ((Ints)to_floats(changed_bits) >> 23) - 126;
-    const Ints same_level = truncated(to_floats(top - high) / static_cast<float>(tree.digit_bits));
-    return changed_bits == 0 ? deepest : smaller(deepest, same_level);
-  }
-  GV_HD Ints child(Mask mask, int32_t level) const {
-    if (walk.rays.deep) return deep_lanes.child(mask, level);
-    const int32_t bits = walk.tree.digit_bits, digit_mask = (1 << bits) - 1;
-    const int32_t shift = bits * (walk.tree.max_depth - level);
-    const Ints x = (cell.x >> shift) & digit_mask, y = (cell.y >> shift) & digit_mask,
-               z = (cell.z >> shift) & digit_mask;
-    return (z << (2 * bits)) | (y << bits) | x;
-  }
-  GV_HD Floats face(Mask mask, int axis, Ints level, Mask upper) const {
-    if (walk.rays.deep) return deep_lanes.face(mask, axis, level, upper);
-    const Ints shift = walk.tree.digit_bits * (walk.tree.max_depth - level);
-    return to_floats((cell[axis] >> shift) - upper) * pick(walk.levels.size, level) - ray.origin[axis];
-  }
-
-  GV_HD Mask hidden(Mask mask, Ints node) {
-    if constexpr (!kKeepsPath) {
-      Floats low{}, high{};
-      for_lanes(mask, [&](int lane) {
-        const auto range = kernel.range_of(node[lane]);
-        low[lane] = range.low;
-        high[lane] = range.high;
+  GV_HD Found find_nodes(Mask mask) {
+    if constexpr (Kernel::kHidesAlike) {
+      return find(mask, Shader::kSeesEmpty);
+    } else {
+      return find(mask, Shader::kSeesEmpty, [&](Mask active, Ints node) {
+        Floats low{}, high{};
+        for_lanes(active, [&](int lane) {
+          const auto range = kernel.range_of(node[lane]);
+          low[lane] = range.low;
+          high[lane] = range.high;
+        });
+        return hides_of(shader, active, low, high, sum);
       });
-      return hides_of(shader, mask, low, high, sum);
     }
-    const Ints states = gather(hidden_tn, node) & 0xff;
-    Mask hides = mask & (states == kHidden);
-    for_lanes(mask & (states == kUnknown), [&](int lane) { set_lane(hides, lane, kernel.hides(node[lane])); });
-    return hides;
   }
-
-  GV_HD void stamp(int32_t* stamps, Mask mask, Ints index) const {
-    if (!any(mask)) return;
-    const Mask old = mask & (pick_shared(stamps, mask ? index : Ints{}) != frame);
-    for_lanes(old, [&](int lane) { store_stamp(&stamps[index[lane]], frame); });
-  }
-
-  // Each lane's entry at its own level.
-  GV_HD static Ints path_entry(const Ints* path, Ints level) {
-    return pick(reinterpret_cast<const int32_t*>(path), level * kLanes + lane_numbers());
-  }
-
-  GV_HD void leave(Mask mask) {
-    intervals.leave(mask, extent);
-    number = mask ? intervals.count : number;
-  }
-
-  GV_HD void set_brick(Mask mask, Ints holder_depth, Ints brick, PacketBrick& to) {
-    const Mask stored = brick >= 0;
-    const Floats scale = pick(walk.levels.scale, holder_depth);
-    const float first = static_cast<float>(kernel.channels.border) - 0.5f;
-    for (int axis = 0; axis < 3; ++axis) {
-      const Floats offset = -face(mask, axis, holder_depth, Mask{}) * scale + first;
-      const Floats slope = ray.direction[axis] * scale;
-      to.offset[axis] = mask ? (stored ? offset : Floats{}) : to.offset[axis];
-      to.slope[axis] = mask ? (stored ? slope : Floats{}) : to.slope[axis];
-    }
-    to.stored = mask ? stored : to.stored;
-    to.brick = mask ? (stored ? values.first_of(brick) : Ints{}) : to.brick;
-    for_lanes(mask & ~stored, [&](int lane) { to.constant[lane] = constant_of(lane, holder_depth); });
-  }
-  GV_HD float constant_of(int lane, Ints depth) const {
-    return channels.value.constant<float>(node_of(lane, depth), kernel.channels.component);
-  }
-  GV_HD Ints depth_of(const PacketBrick& brick) const { return &brick == &fine ? fine_depth : coarse_depth; }
-  GV_HD int32_t node_of(int lane, Ints depth) const { return path_node[depth[lane]][lane] & INT32_MAX; }
+  bool hides(int32_t node) const final { return kernel.hides(node); }
 
   // Begins a run of alike intervals; lanes that need care march alone to the end of the visit at once.
   GV_HD void begin_run(Mask mask) {
-    const Ints last = values.first_of(Ints{} + static_cast<int32_t>(bricks - 1));
+    const Ints last = first_of(Ints{} + static_cast<int32_t>(bricks - 1));
     const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
     const Mask marches_alone = mask & (intervals.cut() | end);
     if (any(marches_alone)) {
@@ -549,17 +312,14 @@ struct PacketWalk {
     }
     return slope;
   }
-  GV_HD Spot<float> spot_of(int lane, const PacketBrick& brick, Ints depth) const {
-    return {node_of(lane, depth), brick.stored[lane] ? path_brick[depth[lane]][lane] : kAbsent,
-            walk.levels.scale[depth[lane]], lane_of(brick.offset, lane), lane_of(brick.slope, lane)};
-  }
 };
 
 // Traces the rays at positions begin to end of the order.
 template <class Shader, class Values>
 void trace_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
   const typename PacketWalk<Shader, Values>::Kernel kernel(args);
-  PacketWalk<Shader, Values> packet(kernel, args);
+  const Values values(kernel.channels.value, args.side, args.component, args.bricks);
+  PacketWalk<Shader, Values> packet(kernel, values, args);
   for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
 }
 
