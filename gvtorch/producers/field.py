@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
-from ..base.boxes import extent_in
-from ..base.constants import DEEP_VOXELS, MAX_EXTENT
+from ..base.boxes import checked_extent, extent_in
+from ..base.constants import DEEP_VOXELS
 from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
@@ -392,7 +392,7 @@ def _grid(
     field: Field | None,
     extent: int | Sequence[int],
     box: Sequence[Sequence[float]] | None,
-) -> tuple[Any, Any]:
+) -> tuple[tuple[int, int, int], Sequence[Sequence[float]]]:
     """Returns extent and box of the grid in `box`, or around a field's box, 2 voxels wider on each
     side.
     """
@@ -403,14 +403,16 @@ def _grid(
         raise ValueError(f"{context}: box must be given: the field does not say where it ends")
     around = around.cpu()
     sides, middle = around[1] - around[0], around.mean(0)
-    if isinstance(extent, int):
-        check.integer(context, "extent", extent, low=5, high=MAX_EXTENT)
-        voxel = sides.max() / (extent - 4)
-        extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
-        half_size = torch.tensor(extent, dtype=torch.float64) * voxel / 2
+    sizes = checked_extent(context, extent)
+    if isinstance(extent, Sequence):
+        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in sizes]))
     else:
-        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in extent]))
-    return extent, ((middle - half_size).tolist(), (middle + half_size).tolist())
+        check.integer(context, "extent", extent, low=5)
+        voxel = sides.max() / (sizes[0] - 4)
+        x, y, z = (math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides)
+        sizes = x, y, z
+        half_size = torch.tensor(sizes, dtype=torch.float64) * voxel / 2
+    return sizes, ((middle - half_size).tolist(), (middle + half_size).tolist())
 
 
 def position_dtype(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.constants import MAX_BRANCHING, MAX_EXTENT
+from ..base.boxes import checked_extent
+from ..base.constants import MAX_BRANCHING
 from ..base.volume import Volume, movable
 from ..pool import Channel
 from ..pool.pools import phrase
@@ -220,11 +221,7 @@ class Producer(torch.nn.Module):
         """
         super().__init__()
         context = type(self).__name__
-        sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
-        if len(sizes) != 3:
-            raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.integer(context, "extent", size, low=1, high=MAX_EXTENT) for size in sizes)
-        self.extent = (x, y, z)
+        self.extent = checked_extent(context, extent)
         if box is not None:
             low, high = check.box(context, box)
             spacing = [(b - a) / n for a, b, n in zip(low, high, self.extent, strict=True)]
