@@ -1,5 +1,5 @@
-"""Arguments of producers, fields, meshes and points that are wrong, or of extreme size: one line says
-what is wrong, and nothing hangs, overflows or is taken silently.
+"""Arguments of producers, fields, meshes and points that are wrong, or of extreme size: one line
+says what is wrong, and nothing hangs, overflows or is taken silently.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import pytest
 import torch
 
 import gvtorch as gv
-from gvtorch import sdf
+from gvtorch import noise, sdf
 
 BALL = sdf.Sphere()
 TALL = ((-1, -1, -1), (1, 1, 3))
 POINTS = [[0.0, 0, 0], [1, 1, 2]]
+PLACES = torch.rand(4, 3)
 
 
 @pytest.mark.parametrize("extent", [(32, 32), "32", None, 32.5, math.nan, (32, 32, 0)])
@@ -26,7 +27,7 @@ POINTS = [[0.0, 0, 0], [1, 1, 2]]
         lambda extent: gv.FieldProducer(BALL, extent, box=TALL),
         lambda extent: gv.Hypertexture(BALL, extent, thickness=0.1),
         lambda extent: gv.PointProducer(POINTS, extent=extent),
-        lambda extent: gv.Producer(extent),
+        gv.Producer,
     ],
 )
 def test_every_producer_says_what_an_extent_must_be(make, extent):
@@ -41,3 +42,53 @@ def test_integers_of_numpy_are_extents():
     assert gv.FieldProducer(BALL, size).extent == gv.FieldProducer(BALL, 32).extent
     assert gv.Hypertexture(BALL, size, thickness=0.1, box=TALL).extent == (16, 16, 32)
     assert gv.PointProducer(POINTS, extent=size).extent == (16, 16, 32)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: noise.fbm(PLACES, lacunarity=1e300), "noise.fbm: 6 octaves of lacunarity 1e+300"),
+        (lambda: noise.fbm(PLACES, gain=1e300), "6 octaves of lacunarity 2 and gain 1e+300 exceed"),
+        (lambda: noise.fbm(PLACES, lacunarity=math.inf, period=4), "lacunarity must be finite"),
+        (lambda: noise.fbm(PLACES, lacunarity=math.nan, period=4), "lacunarity must be finite"),
+        (lambda: noise.warp(PLACES, seed=2**62), "noise.warp: seed must be an int"),
+        (lambda: noise.warp(PLACES, seed="a"), "noise.warp: seed must be an int"),
+        (lambda: noise.bounds(noise.cellular, 5), "nothing is known of 'cellular' in 5 dim"),
+        (lambda: noise.OctaveSum(settled="a"), "noise.OctaveSum: settled must be a number"),
+        (lambda: gv.Julia((1e21, 0, 0)), "Julia: length of the constant must be finite and <= 1e"),
+        (lambda: gv.Mandelbulb(colors=5), "colors must be (3, 3) numbers, got ()"),
+        (lambda: gv.Mandelbulb(colors=((2, 0, 0),) * 3), "Mandelbulb: colors must be in 0 to 1"),
+        (lambda: sdf.Repeat(sdf.Sphere(0.3), (1, 1, 1), (3,)), "count must be (x, y, z), got (3,)"),
+        (lambda: sdf.Repeat(sdf.Sphere(0.3), (1, 1, 1), 3), "count must be (x, y, z), got 3"),
+        (lambda: sdf.Plane((1e200, 0, 0)), "Plane: normal must have a direction"),
+        (lambda: sdf.rotated(BALL, (1e200, 0, 0), 90), "rotated: axis must have a direction"),
+        (lambda: gv.warp(BALL, sdf.Sphere(), 0.1)(PLACES), "offset must give (..., 3) at (..., 3)"),
+    ],
+)
+def test_bad_fields_have_one_clear_line(call, message):
+    with pytest.raises(ValueError) as caught:
+        call()
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_boxes_of_extreme_fractals_are_finite():
+    """Orbits of the largest constants and of the most steps."""
+    for fractal in (
+        gv.Julia((1e20, 0, 0)),
+        gv.Julia((0, 0, 1e20), 64),
+        gv.Mandelbox(2.5, iterations=1000),
+    ):
+        assert torch.isfinite(fractal.box()).all()
+    assert fractal.box()[1, 0] == 14 / 3
+
+
+def test_a_point_that_is_nan_has_no_distance_in_a_volume():
+    shape = gv.SampledDistance(gv.Volume(torch.rand(8, 8, 8, 1)))
+    assert shape(torch.tensor([[math.nan, 0, 0], [1, math.nan, 2]])).isnan().all()
+    assert torch.isfinite(shape(torch.tensor([[1.0, 2, 3]]))).all()
+
+
+def test_points_may_be_as_wide_as_float64_goes():
+    box = ((0, 0, 0), (0.1, 0.1, 0.1))
+    producer = gv.PointProducer([[0.05] * 3], radius=1e308, extent=8, box=box)
+    assert producer.at(torch.full((1, 3), 0.05))["value"].abs().max() < 1e-6

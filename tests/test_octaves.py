@@ -92,6 +92,14 @@ def test_bricks_without_parents_are_whole():
         assert (alone - bricks).abs().max() < 1e-3 and (calm - settled).abs().max() < 1e-3
 
 
+def test_octaves_may_become_coarser():
+    """With a lacunarity below 1, the octaves that settle first are the last ones."""
+    total = noise.OctaveSum(frequency=2.0**10, lacunarity=0.5, octaves=14, gain=0.9)
+    for axes, side, bricks, _ in descent(total, 9):
+        expected = direct(total, axes, side)
+        assert (bricks - expected).abs().max() < 0.01 and expected.abs().max() > 0.1
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

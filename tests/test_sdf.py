@@ -83,7 +83,7 @@ def test_any_iteration_makes_a_fractal_and_what_is_not_known_is_not_proven():
     assert shape.bounds(center, half)[0] > 0, "beyond the bailout it escapes at once"
     with pytest.raises(ValueError, match="Fractal: iteration must be a Iteration, got int"):
         gv.Fractal(3)
-    with pytest.raises(ValueError, match="colors must be three colours, got 1"):
+    with pytest.raises(ValueError, match=r"colors must be \(3, 3\) numbers, got \(1, 3\)"):
         gv.Mandelbulb(colors=((0, 0, 0),))
 
 

@@ -12,6 +12,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from ..base import check
 from .distance import HASH, Changed, Distance, grown
 from .field import Bounds, Field, Interval, Values, between, checked_field
 from .solid import Solid
@@ -56,6 +57,9 @@ class Warp(Field):
 
     def forward(self, points: Tensor) -> Values:
         displacement = self.offset(points)
+        if not isinstance(displacement, Tensor) or displacement.shape != points.shape:
+            got = check.describe(displacement)
+            raise ValueError(f"Warp: offset must give (..., 3) at (..., 3) points, got {got}")
         magnitude = torch.linalg.vector_norm(displacement, dim=-1, keepdim=True)
         return self.field(
             points + displacement * (self.max_offset / magnitude.clamp(min=1e-30)).clamp(max=1)

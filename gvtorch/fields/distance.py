@@ -13,7 +13,7 @@ Sources: Hart, "Sphere tracing: a geometric method for the antialiased ray traci
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -40,15 +40,12 @@ class Distance(Field):
 
     exact: bool = True
     smooth: bool = True
+    color: Tensor  # (3,) float64
 
     def __init__(self, color: Color = WHITE) -> None:
         """Sets the colour of the surface."""
         super().__init__()
-        context = type(self).__name__
-        red, green, blue = check.triple(context, "color", color)
-        if min(red, green, blue) < 0 or max(red, green, blue) > 1:
-            raise ValueError(f"{context}: color must be in 0 to 1, got {tuple(color)}")
-        self.color = self.vector("color", (red, green, blue))
+        self.register_buffer("color", checked_colors(type(self).__name__, "color", color, (3,)))
 
     def forward(self, points: Tensor) -> Tensor:
         """Returns (...,) signed distances at points (..., 3)."""
@@ -298,6 +295,14 @@ class SmoothDifference(SmoothIntersection):
         """Sets the shapes and the width of the blend, see `SmoothUnion`."""
         check.instance("SmoothDifference", "second", second, Distance)
         super().__init__(first, Negative(second), width)
+
+
+def checked_colors(context: str, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
+    """Returns float64 colours of a shape; ValueError unless all their numbers are in [0, 1]."""
+    colors = check.reals(context, name, value, shape)
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise ValueError(f"{context}: {name} must be in 0 to 1, got {check.quoted(value)}")
+    return colors
 
 
 def joint_box(first: Tensor | None, second: Tensor | None) -> Tensor | None:

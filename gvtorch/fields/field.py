@@ -161,6 +161,15 @@ def checked_field(context: str, name: str, value: Any) -> nn.Module:
     raise ValueError(f"{context}: {name} must be a field, got {kind}{reason}")
 
 
+def unit_vector(context: str, name: str, value: Sequence[float] | Tensor) -> Tensor:
+    """Returns (3,) float64 a user's direction, of length 1; ValueError if it has no length."""
+    vector = torch.tensor(check.triple(context, name, value), dtype=torch.float64)
+    norm = vector.norm()
+    if not 0 < float(norm) < math.inf:
+        raise ValueError(f"{context}: {name} must have a direction, got {tuple(value)}")
+    return vector / norm
+
+
 def length(vectors: Tensor) -> Tensor:
     """Returns (...,) lengths of vectors (..., c), whose gradient at 0 is 0, not NaN."""
     return torch.linalg.vector_norm(vectors, dim=-1)

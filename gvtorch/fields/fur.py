@@ -15,6 +15,7 @@ from ..base import check
 from . import noise
 from .distance import Distance, OfShape, grown
 from .field import Interval, length
+from .noise.fractal import MOST_SEED
 
 _SKIN_VALUE = 0.1  # value of skin and roots
 # Height at which hairs end, in lengths: mean + spread * noise.
@@ -56,7 +57,7 @@ class Fur(OfShape):
         self.length = self.number("length", length, low=0, open_low=True)
         self.frequency = self.number("frequency", frequency, low=0, open_low=True)
         self.fall = self.vector("fall", fall)
-        self.seed = check.integer("Fur", "seed", seed, low=-(2**62), high=2**62)
+        self.seed = check.integer("Fur", "seed", seed, low=-MOST_SEED, high=MOST_SEED)
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
         return self.filtered(points, torch.zeros_like(points))

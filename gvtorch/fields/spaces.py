@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import Changed, Distance, grown
-from .field import Interval, box_distance, length, tighter
+from .field import Interval, box_distance, length, tighter, unit_vector
 
 Matrix = Sequence[Sequence[float]]
 
@@ -168,7 +168,9 @@ class Repeat(Space):
         if beyond is None or bool((beyond[self._axes] > 1e-9).any()):
             size = "no box" if box is None else f"box {box.tolist()}"
             raise ValueError(f"{context}: the shape must lie within its cell, it has {size}")
-        counts = (None,) * 3 if count is None else tuple(count)
+        if count is not None and (not isinstance(count, Sequence) or len(count) != 3):
+            raise ValueError(f"{context}: count must be (x, y, z), got {count!r}")
+        counts = count or (None,) * 3
         for axis_count in counts:
             if (
                 axis_count is not None
@@ -346,11 +348,8 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
     Raises:
         ValueError: The axis has no direction, or a number is not finite.
     """
-    direction = torch.tensor(check.triple("rotated", "axis", axis), dtype=torch.float64)
-    if not float(direction.norm()) > 0:
-        raise ValueError(f"rotated: axis must have a direction, got {tuple(axis)}")
+    x, y, z = unit_vector("rotated", "axis", axis).tolist()
     angle = math.radians(check.number("rotated", "degrees", degrees))
-    x, y, z = (direction / direction.norm()).tolist()
     cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64)
     matrix = torch.eye(3).double() + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     return Transform(shape, matrix)

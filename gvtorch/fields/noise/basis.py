@@ -206,7 +206,7 @@ def bounds(basis: Basis, n: int = 3) -> Bounds:
     options: dict[str, Any] = {}
     while isinstance(basis, partial):
         options, basis = basis.keywords | options, basis.func
-    if basis is cellular:
+    if basis is cellular and n in (2, 3):
         slope = 2.0 if options.get("feature", "F1") == "F2-F1" else 1.0
         return Bounds(0.0, float(options.get("reach", 1)), slope)
     if (basis, n) not in _BOUNDS:
