@@ -237,3 +237,27 @@ def test_a_julia_set_takes_any_three_numbers():
     assert torch.equal(*values) and values[0].unique().numel() > 10
     with pytest.raises(ValueError, match="constant must be three numbers"):
         gv.Julia(())
+
+
+LONG = sdf.scaled(sdf.Sphere(), 4, 1, 1)  # its value rises by 1/4 per unit of length along x
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: sdf.Offset(LONG, 0.5),
+        lambda: sdf.Shell(LONG, 0.5),
+        lambda: sdf.SmoothUnion(LONG, LONG, 1.0),
+        lambda: sdf.Offset(sdf.moved(LONG, 1, 0, 1) | sdf.Sphere(), 0.5),
+        lambda: sdf.Offset(sdf.Twist(sdf.rotated(LONG, (0, 0, 1), 30), 0.5) & sdf.Sphere(4), 0.5),
+        lambda: sdf.Offset(sdf.Revolution(sdf.Extrusion(LONG, 1.0), 1.0), 0.5),
+        lambda: sdf.Offset(sdf.Repeat(LONG, (9, 0, 3), (3, 1, 1)), 0.4),
+        lambda: sdf.SmoothIntersection(sdf.Offset(LONG, 1.0), sdf.Sphere(7), 0.1),
+    ],
+)
+def test_boxes_hold_what_grows_from_stretched_shapes(make):
+    """An offset in units of the value reaches farther than in the world where space is stretched."""
+    shape, points = make(), random_points(100_000, 14.0)
+    low, high = shape.box()
+    inside = points[shape(points) < 0]
+    assert len(inside) > 20 and ((inside >= low) & (inside <= high)).all()

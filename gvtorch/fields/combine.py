@@ -35,6 +35,9 @@ class Painted(Changed):
     def box(self) -> Tensor | None:
         return self.shape.box()
 
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return self.shape.level_box(level)
+
 
 class Warp(Field):
     """A field evaluated at points that another field displaces."""

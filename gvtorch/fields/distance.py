@@ -79,6 +79,13 @@ class Distance(Field):
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self
 
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        """Returns (2, 3) float64 corners of a box outside which the value exceeds a level >= 0;
+        None: unknown. Unless overridden, this is `box` grown by the level, which is right if the
+        value is at least the distance from `box`.
+        """
+        return grown(self.box(), level)
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """Returns intervals (k, 3) float64 that hold the colours everywhere in boxes."""
         color = self.color.to(center).expand_as(center)
@@ -95,7 +102,9 @@ class Distance(Field):
 
 
 class Pair(Distance):
-    """Base of combinations of two shapes by `mix`, which must not decrease with either value."""
+    """Base of combinations of two shapes by `mix`, which must not decrease with either value. If
+    the result may be less than both values, a subclass overrides `level_box`, as `SmoothUnion` does.
+    """
 
     def __init__(self, first: Distance, second: Distance) -> None:
         """Sets the shapes, which keep their colours."""
@@ -170,7 +179,10 @@ class Pair(Distance):
         return (first * HASH + second) * 3 + relevance
 
     def box(self) -> Tensor | None:
-        return joint_box(self.first.box(), self.second.box())
+        return self.level_box(0.0)
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return joint_box(self.first.level_box(level), self.second.level_box(level))
 
 
 class Union(Pair):
@@ -186,8 +198,8 @@ class Intersection(Pair):
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         return torch.maximum(first, second), second > first
 
-    def box(self) -> Tensor | None:
-        return common_box(self.first.box(), self.second.box())
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return common_box(self.first.level_box(level), self.second.level_box(level))
 
 
 class SmoothUnion(Pair):
@@ -203,8 +215,8 @@ class SmoothUnion(Pair):
         weight = (0.5 + 0.5 * (first - second) / self.width).clamp(0, 1)
         return torch.lerp(first, second, weight) - self.width * weight * (1 - weight), weight
 
-    def box(self) -> Tensor | None:
-        return grown(super().box(), self.width / 4)
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return super().level_box(level + self.width / 4)
 
 
 class OfShape(Field):
@@ -284,8 +296,11 @@ class SmoothIntersection(Negative):
         self._parts = (first, second)
 
     def box(self) -> Tensor | None:
+        return self.level_box(0.0)
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
         first, second = self._parts
-        return common_box(first.box(), second.box())
+        return common_box(first.level_box(level), second.level_box(level))
 
 
 class SmoothDifference(SmoothIntersection):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..base import check
 from . import noise
-from .distance import Distance, OfShape, grown
+from .distance import Distance, OfShape
 from .field import Interval, length
 from .noise.fractal import MOST_SEED
 
@@ -86,4 +86,4 @@ class Fur(OfShape):
     def box(self) -> Tensor | None:
         """Returns the box around the shape and its hairs."""
         max_height = _MEAN_HEIGHT + _HEIGHT_SPREAD * noise.bounds(noise.perlin).high
-        return grown(self.shape.box(), max_height * self.length)
+        return self.shape.level_box(max_height * self.length)

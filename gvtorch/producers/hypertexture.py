@@ -108,12 +108,12 @@ class Hypertexture(EvaluationCounter, Producer):
         peak = amplitude * sum(o.amplitude for o in series) * noise.bounds(noise.perlin).high
         max_offset = thickness * max(peak + softness - 0.5, 0.0)
         if box is None:
-            shape_box = shape.box()
-            if shape_box is None or not bool(shape_box.isfinite().all()):
+            around = shape.level_box(max_offset)
+            if around is None or not bool(around.isfinite().all()):
                 raise ValueError(
                     f"{context}: box must be given: the shape does not say where it ends"
                 )
-            box = [(shape_box[0] - max_offset).tolist(), (shape_box[1] + max_offset).tolist()]
+            box = around.tolist()
         extent = extent_in(context, extent, box)
         check.float_dtype(context, dtype)
         channels = {"density": Channel(dtype)}
