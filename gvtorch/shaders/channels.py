@@ -263,7 +263,8 @@ def _make_table(
         table[:, header_row] = component, low, (len(rows) - 1) / (high - low), len(rows)
         table[:, row_slice, :3] = rows[:, :3]
         with np.errstate(divide="ignore"):
-            halvings = np.log1p(-rows[:, 3]) * (-function.length(sampling) / math.log(2))
+            (length,) = sampling.lengths(function.reference, 1)
+            halvings = np.log1p(-rows[:, 3]) * (-length / math.log(2))
         table[:, row_slice, 3] = (
             np.minimum(halvings, _OPAQUE_HALVINGS) * 2.0 ** np.arange(levels)[:, None]
         )

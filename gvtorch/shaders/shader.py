@@ -27,6 +27,7 @@ from ..ops.shading import (
 )
 from ..pool import N3Tree
 
+LARGEST = 1e300  # limit of values and lengths, so that their differences are finite
 _MAX_TABLE_BYTES = 64 * 2**20  # limit for a table in float32
 _CPU = torch.device("cpu")
 
@@ -46,6 +47,15 @@ class Sampling:
         many (at least 1) as keep the table within 64 MB in float32.
         """
         return max(1, min(self.levels, _MAX_TABLE_BYTES // (16 * rows)))
+
+    def lengths(self, reference: float | None, levels: int) -> np.ndarray:
+        """Returns (levels,) float64 lengths of intervals in units of a reference length, None: the
+        smallest spacing; at most 1e300, so that an infinite length of a transparent value is still
+        transparent.
+        """
+        shortest = min(self.step / (reference or self.smallest_spacing), LARGEST)
+        with np.errstate(over="ignore"):
+            return np.minimum(shortest * 2.0 ** np.arange(levels), LARGEST)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,6 +297,12 @@ def one_color(color: Triple, sampling: Sampling) -> ColorTable:
         domain_2=pack((0.0, 1.0), sampling.dtype, sampling.device),
         opaque_m=torch.arange(1, 3, dtype=torch.int32, device=sampling.device),
     )
+
+
+def alpha_over(length: np.ndarray | float, opacity: np.ndarray) -> np.ndarray:
+    """Returns the alpha over lengths in reference lengths, given the opacity over one of these."""
+    with np.errstate(divide="ignore"):
+        return -np.expm1(length * np.log1p(-opacity))
 
 
 def row_and_fraction(position: Tensor, count: int) -> tuple[Tensor, Tensor]:
