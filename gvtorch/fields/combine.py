@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ..base import check
 from .distance import HASH, Changed, Distance, grown
-from .field import Bounds, Field, Interval, Values, between, checked_field
+from .field import Bounds, Field, Interval, Values, between, checked_field, modules_by_name
 from .solid import Solid
 
 
@@ -91,8 +91,8 @@ class Stack(Field):
         super().__init__()
         if not fields:
             raise ValueError("Stack: needs a field by name")
-        self.fields = nn.ModuleDict(
-            {name: checked_field("Stack", name, field) for name, field in fields.items()}
+        self.fields = modules_by_name(
+            "Stack", {name: checked_field("Stack", name, field) for name, field in fields.items()}
         )
         self.prefiltered = _prefiltered("Stack", fields.values())
 

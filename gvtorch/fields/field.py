@@ -161,6 +161,14 @@ def checked_field(context: str, name: str, value: Any) -> nn.Module:
     raise ValueError(f"{context}: {name} must be a field, got {kind}{reason}")
 
 
+def modules_by_name(context: str, parts: Mapping[str, nn.Module]) -> nn.ModuleDict:
+    """Returns modules by the names of channels; ValueError for a name that torch refuses."""
+    try:
+        return nn.ModuleDict(parts)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{context}: bad name of a channel: {error.args[0]}") from None
+
+
 def unit_vector(context: str, name: str, value: Sequence[float] | Tensor) -> Tensor:
     """Returns (3,) float64 a user's direction, of length 1; ValueError if it has no length."""
     vector = torch.tensor(check.triple(context, name, value), dtype=torch.float64)
