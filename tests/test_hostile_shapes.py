@@ -12,11 +12,17 @@ import torch
 
 import gvtorch as gv
 from gvtorch import noise, sdf
+from gvtorch.shaders.shader import Sampling
 
 BALL = sdf.Sphere()
 TALL = ((-1, -1, -1), (1, 1, 3))
 POINTS = [[0.0, 0, 0], [1, 1, 2]]
 PLACES = torch.rand(4, 3)
+BYTES = np.full((4, 4, 4), 255, np.uint8)
+
+
+def triangle(**fields):
+    return gv.Mesh(**{"vertices": np.eye(3), "faces": [[0, 1, 2]], **fields})
 
 
 @pytest.mark.parametrize("extent", [(32, 32), "32", None, 32.5, math.nan, (32, 32, 0)])
@@ -63,9 +69,25 @@ def test_integers_of_numpy_are_extents():
         (lambda: sdf.Plane((1e200, 0, 0)), "Plane: normal must have a direction"),
         (lambda: sdf.rotated(BALL, (1e200, 0, 0), 90), "rotated: axis must have a direction"),
         (lambda: gv.warp(BALL, sdf.Sphere(), 0.1)(PLACES), "offset must give (..., 3) at (..., 3)"),
+        (lambda: gv.stack(values=BALL), "Stack: bad name of a channel: attribute 'values' already"),
+        (lambda: gv.JoinedProducer({"a.b": gv.Producer(8)}), "bad name of a channel: module name"),
+        (lambda: gv.Producer(8, value_range={"value": 3}), "value_range['value'] must be (2,) num"),
+        (lambda: gv.Producer(8, value_range={"value": "ab"}), "value_range['value'] must be numbe"),
+        (lambda: gv.Producer(8, value_range=[1]), "value_range must be a dict by channel, got a l"),
+        (lambda: gv.Producer(8, labels=[1]), "labels must be a dict by channel, got a list"),
+        (lambda: triangle(faces=5), "mesh: faces must be (n, 3), got (1,)"),
+        (lambda: triangle(faces=[[0, 1, 2], [1]]), "mesh: faces must be (n, 3) numbers"),
+        (lambda: triangle(faces=None), "mesh: faces must be (n, 3) numbers"),
+        (lambda: triangle(vertices=None), "mesh: vertices must be (n, 3), got (1,)"),
+        (lambda: gv.Material(color=(1, 1)), "material '': color must be (4,) numbers, got (2,)"),
+        (lambda: gv.Material(color=(1, 1, 1, math.nan)), "material '': color must be finite"),
+        (lambda: gv.Material(texture=np.ones((4, 4, 4))), "texture must be (h, w, 4) uint8, got"),
+        (lambda: gv.Material(texture=BYTES[..., :3]), "uint8, got (4, 4, 3) uint8"),
+        (lambda: gv.Material(texture=BYTES[:0]), "uint8, got (0, 4, 4) uint8"),
+        (lambda: gv.Material(texture="wood.png"), "uint8, got 'wood.png'"),
     ],
 )
-def test_bad_fields_have_one_clear_line(call, message):
+def test_bad_arguments_have_one_clear_line(call, message):
     with pytest.raises(ValueError) as caught:
         call()
     assert message in str(caught.value) and "\n" not in str(caught.value)
@@ -92,3 +114,17 @@ def test_points_may_be_as_wide_as_float64_goes():
     box = ((0, 0, 0), (0.1, 0.1, 0.1))
     producer = gv.PointProducer([[0.05] * 3], radius=1e308, extent=8, box=box)
     assert producer.at(torch.full((1, 3), 0.05))["value"].abs().max() < 1e-6
+
+
+def test_labels_of_the_smallest_reference_length_are_opaque_or_absent():
+    volume = gv.Volume((torch.rand(8, 8, 8, 1) * 3).to(torch.uint8), labels=True)
+    tree = gv.N3Tree.from_volume(volume)
+    sampling = Sampling(smallest_spacing=1.0, step=0.5, levels=30)
+    table = gv.Labels(reference=5e-324, opacity=0.5).table_of(tree, "value", sampling)
+    assert (table.table_lm4[:, 0, 3] == 0).all() and (table.table_lm4[:, 1:3, 3] == 1).all()
+
+
+def test_no_points_have_no_values():
+    producer = gv.VolumeProducer(gv.Volume(torch.rand(8, 8, 8, 2)))
+    values = producer.at(torch.empty(4, 0, 3))["value"]
+    assert values.shape == (4, 0, 2) and values.dtype == torch.float32

@@ -256,7 +256,7 @@ LONG = sdf.scaled(sdf.Sphere(), 4, 1, 1)  # its value rises by 1/4 per unit of l
     ],
 )
 def test_boxes_hold_what_grows_from_stretched_shapes(make):
-    """An offset in units of the value reaches farther than in the world where space is stretched."""
+    """Where space is stretched, an offset reaches farther in the world than in the value."""
     shape, points = make(), random_points(100_000, 14.0)
     low, high = shape.box()
     inside = points[shape(points) < 0]

@@ -102,8 +102,8 @@ class Distance(Field):
 
 
 class Pair(Distance):
-    """Base of combinations of two shapes by `mix`, which must not decrease with either value. If
-    the result may be less than both values, a subclass overrides `level_box`, as `SmoothUnion` does.
+    """Base of combinations of two shapes by `mix`, which must not decrease with either value. A
+    subclass whose value may be less than both overrides `level_box`, as `SmoothUnion` does.
     """
 
     def __init__(self, first: Distance, second: Distance) -> None:

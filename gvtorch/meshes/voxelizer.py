@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from ..ops.voxelize import Voxelized
-from .geometry import Geometry
+from .geometry import HALF_DIAGONAL, Geometry
 from .holes import SolidParts, filled
 from .mesh import Mesh
 from .paint import Paint
@@ -32,7 +32,6 @@ _MARGIN_VOXELS = 2  # voxels around the mesh
 _CUBE_VOXELS, _BLOCK_CUBES = 8, 4
 _BATCH_VOXELS = 1 << 20  # voxels that are computed together
 _SAMPLES_PER_SIDE = 2  # samples along a side of a coarse voxel, which is their mean
-_HALF_DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
 _FLOAT32_VOXELS = 2048.0  # size of a triangle, in voxels, from which on float64 is used
 
 
@@ -149,7 +148,7 @@ class Voxelizer:
 
     def reach(self, voxel_k: Tensor) -> Tensor:
         """Returns (k,) the world distance up to which triangles affect voxels of sizes (k,)."""
-        distance = (_HALF_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
+        distance = (HALF_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
         return distance if {"coverage"} == {*self.channels} else distance.clamp(min=self.band)
 
     def touched(self, low_k3: Tensor, size_k: Tensor, voxel_k: Tensor) -> tuple[Tensor, Tensor]:
