@@ -9,7 +9,6 @@ from helpers.pictures import GRAY, camera
 import gvtorch as gv
 from gvtorch.fields import Field
 from gvtorch.producers import Layout
-from gvtorch.producers.producer import Layout
 
 BOX = ((-1, -1, -1), (1, 1, 1))
 

@@ -56,7 +56,7 @@ def group_rows(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     return positions[starts], np.split(order, later_starts)[: len(order)]
 
 
-def checked_extent(context: str, extent: int | Sequence[int]) -> tuple[int, int, int]:
+def extent_of(context: str, extent: int | Sequence[int]) -> tuple[int, int, int]:
     """Returns voxels along x, y, z, given these or one number for all; ValueError otherwise."""
     sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
     if len(sizes) != 3:
@@ -71,7 +71,7 @@ def extent_in(
     """Returns an extent (x, y, z) as it is. A single number is the extent along the box's longest
     side; the others are chosen so that voxels are cubes, or nearly so. ValueError if it is neither.
     """
-    sizes = checked_extent(context, extent)
+    sizes = extent_of(context, extent)
     if isinstance(extent, Sequence):
         return sizes
     low, high = check.box(context, box)

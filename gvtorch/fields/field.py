@@ -76,7 +76,8 @@ class Field(nn.Module):
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Bounds:
         """Returns intervals that hold the means over all voxels within the boxes, of sides `size`
-        (k, 3) float64 or smaller. By default those of `bounds`, which hold for means as well.
+        (k, 3) float64 or smaller; if there is a margin, what `finish` returns there. By default
+        those of `bounds`, which hold for means as well.
         """
         return self.bounds(center, half)
 

@@ -185,12 +185,8 @@ class Hypertexture(EvaluationCounter, Producer):
         """Returns EMPTY where density is proven 0 for any noise, CONSTANT where it is proven 1 and
         there is no channel "distance", else DATA.
         """
-        layout = nodes.layout
-        half_extent = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
-        ends = self.shape.bounds(nodes.center, half_extent)
-        low, high = (
-            end[:, 0] for end in interval_of(self.shape, "value", ends, len(half_extent), 1)
-        )
+        ends = self.shape.bounds(nodes.center, nodes.half_extent(0))
+        low, high = (end[:, 0] for end in interval_of(self.shape, "value", ends, len(nodes), 1))
         margin = self._margins.to(low.device)[nodes.depth]
         kind = torch.full_like(nodes.depth, Region.DATA)
         if "distance" not in self.channels:

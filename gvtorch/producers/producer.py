@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.boxes import checked_extent
+from ..base.boxes import extent_of
 from ..base.constants import MAX_BRANCHING
 from ..base.volume import Volume, movable
 from ..pool import Channel
@@ -235,7 +235,7 @@ class Producer(torch.nn.Module):
         """
         super().__init__()
         context = type(self).__name__
-        self.extent = checked_extent(context, extent)
+        self.extent = extent_of(context, extent)
         if box is not None:
             low, high = check.box(context, box)
             spacing = [(b - a) / n for a, b, n in zip(low, high, self.extent, strict=True)]

@@ -221,11 +221,7 @@ class Shader(Checked):
                 tree.fine_channel(context, name)
         if self.kind is None:
             return None
-        if self.normals is not None and channels[self.normals].width != 3:
-            raise ValueError(
-                f"{context}: normals need 3 numbers a voxel, "
-                f"{self.normals!r} has {channels[self.normals].width}"
-            )
+        check_width(f"{context}: normals need", tree, self.normals, 3)
         if self.other is not None:
             last = channels[self.other].width - 1
             check.integer(
@@ -326,6 +322,20 @@ def check_shader(context: str, name: str, value: Any) -> None:
         raise ValueError(
             f"{context}: {name} must be a TransferFunction or another shader, got {kind}"
         )
+
+
+def check_width(
+    claim: str, tree: N3Tree, name: str | None, width: int, directional: int | None = None
+) -> int:
+    """Returns how many numbers a voxel has in a channel of a tree, `width` if there is no such
+    channel. Raises ValueError, which begins with `claim`, unless they are `width`, or as many as
+    hold six directions, `directional`.
+    """
+    channel = tree.bricks.channels.get(str(name))
+    if channel is None or channel.width in (width, directional):
+        return width if channel is None else channel.width
+    directions = "" if directional is None else f", or {directional} for six directions"
+    raise ValueError(f"{claim} {width} numbers a voxel{directions}, {name!r} has {channel.width}")
 
 
 def number_of_one(dtype: torch.dtype) -> float:
