@@ -18,6 +18,7 @@ BALL = sdf.Sphere()
 TALL = ((-1, -1, -1), (1, 1, 3))
 POINTS = [[0.0, 0, 0], [1, 1, 2]]
 PLACES = torch.rand(4, 3)
+VOLUME = gv.Volume(torch.rand(8, 8, 8, 2))
 BYTES = np.full((4, 4, 4), 255, np.uint8)
 
 
@@ -84,6 +85,22 @@ def test_integers_of_numpy_are_extents():
         (lambda: gv.Material(texture=np.ones((4, 4, 4))), "texture must be (h, w, 4) uint8, got"),
         (lambda: gv.Material(texture=BYTES[..., :3]), "uint8, got (4, 4, 3) uint8"),
         (lambda: gv.Material(texture=BYTES[:0]), "uint8, got (0, 4, 4) uint8"),
+        (lambda: triangle(materials=None), "mesh: materials must be a list, got None"),
+        (lambda: triangle(materials=("a",)), "mesh: each of materials must be a Material, got str"),
+        (lambda: gv.MeshProducer(triangle(), channels=5), "channels must be a list, got 5"),
+        (lambda: gv.MeshProducer(triangle(), band=1e300), "voxelize: band must be finite and >= 2"),
+        (lambda: gv.SampledDistance.of_mesh(triangle(), resolution=2**20), "GiB"),
+        (lambda: gv.PointProducer(POINTS, box=3), "sort_points: box must be two corners, got 3"),
+        (lambda: gv.Channels(3), "Channels: looks must be a list, got 3"),
+        (lambda: gv.Channels.of(VOLUME, components=5), "components must be a list, got 5"),
+        (lambda: gv.ModuleShader(print, channels=5), "channels must be names, got 5"),
+        (lambda: gv.ModuleShader(print, channels=()), "channels must be names, got ()"),
+        (
+            lambda: gv.TransferFunction.preset("gray", 0, 1e308),
+            "stretched: high must be finite",
+        ),
+        (lambda: noise.SplineSum().bricks([PLACES] * 3, 0.0), "SplineSum: side must be finite and"),
+        (lambda: noise.perlin(5), "noise.perlin: points must be (..., n) or n tensors"),
         (lambda: gv.Material(texture="wood.png"), "uint8, got 'wood.png'"),
     ],
 )

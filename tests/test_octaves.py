@@ -100,7 +100,7 @@ def test_octaves_may_become_coarser():
         assert (bricks - expected).abs().max() < 0.01 and expected.abs().max() > 0.1
 
 
-def of_mean(function):
+def of_values(function):
     return gv.OctaveProducer(noise.OctaveSum(), 8, values=lambda s, _: function(s)).at(
         torch.ones(1, 3)
     )
@@ -118,8 +118,8 @@ def of_mean(function):
             lambda p, c: gv.OctaveProducer(noise.OctaveSum(), 8, values=3),
             "values must be a function",
         ),
-        (lambda p, c: of_mean(lambda s: s.mean()), "values must return (1, 10, 10, 10), got ()"),
-        (lambda p, c: of_mean(lambda s: 1.0), "values must return (1, 10, 10, 10), got float"),
+        (lambda p, c: of_values(lambda s: s.mean()), "values must return (1, 10, 10, 10), got ()"),
+        (lambda p, c: of_values(lambda s: 1.0), "values must return (1, 10, 10, 10), got float"),
     ],
 )
 def test_bad_input_gives_one_clear_line(call, message):

@@ -23,7 +23,7 @@ from .field import Field, Interval, between, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
-HASH = 0x9E3779B1
+HASH = 0x9E3779B1  # odd factor by which `alike` combines the numbers of parts
 _ROUNDING = 2.0**-16  # times the size of coordinates: rounding in float32 changes values by less
 
 

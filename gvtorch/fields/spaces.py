@@ -29,7 +29,10 @@ class Space(Changed):
         return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
-        """Returns the value at points, given the shape's; must not decrease as that grows."""
+        """Returns the value at points, given the shape's; must not decrease as that grows. `bounds`
+        calls it for the centres of boxes, so a subclass whose value also depends on points
+        overrides `bounds`.
+        """
         return value
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor | float:

@@ -106,6 +106,8 @@ class Mesh:
         if bad:
             raise ValueError(f"{self.name}: {bad} corners of triangles are NaN or infinite")
         assert self.material is not None
+        for entry in check.items(self.name, "materials", self.materials):
+            check.instance(self.name, "each of materials", entry, Material)
         low, high = int(self.material.min()), int(self.material.max())
         if low < 0 or high >= len(self.materials):
             bad_index = low if low < 0 else high

@@ -27,6 +27,7 @@ CHANNELS = {
     "normal": (torch.int8, 3),
     "material": (torch.uint8, 1),
 }
+_MOST_VOXELS = 2**30  # most voxels along a side, and of a length in voxels
 _MARGIN_VOXELS = 2  # voxels around the mesh
 # Voxels along a cube's side; cubes along the side of a block of a region.
 _CUBE_VOXELS, _BLOCK_CUBES = 8, 4
@@ -46,7 +47,7 @@ class GridSettings(TypedDict, total=False):
 
 def check_channels(context: str, channels: str | Sequence[str]) -> tuple[str, ...]:
     """Returns the names as a tuple; ValueError if there are none, or unknown or repeated ones."""
-    names = (channels,) if isinstance(channels, str) else tuple(channels)
+    names = (channels,) if isinstance(channels, str) else check.items(context, "channels", channels)
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):
         rejected = f"{unknown[0]!r}" if unknown else f"{names!r}"
@@ -107,7 +108,7 @@ class Voxelizer:
             ValueError: An unknown channel, or a number out of its range.
         """
         context = "voxelize"
-        check.integer(context, "resolution", resolution, low=8, high=2**30)
+        check.integer(context, "resolution", resolution, low=8, high=_MOST_VOXELS)
         check.one_of(context, "solid", solid, get_args(SolidParts))
         channels = check_channels(context, channels)
         if solid == "always":
@@ -134,8 +135,9 @@ class Voxelizer:
         middle, half_extent = 0.5 * (low + high), [0.5 * (n - 1) * self.spacing for n in counts]
         x, y, z = (float(m - h) for m, h in zip(middle, half_extent, strict=True))
         self.origin = (x, y, z)
-        self.band = check.number(context, "band", band, low=2) * self.spacing
-        self.thickness = check.number(context, "thickness", thickness, low=0.1) * self.spacing
+        band = check.number(context, "band", band, low=2, high=_MOST_VOXELS)
+        thickness = check.number(context, "thickness", thickness, low=0.1, high=_MOST_VOXELS)
+        self.band, self.thickness = band * self.spacing, thickness * self.spacing
         self.device = torch.device(device)
         self.geometry = Geometry(mesh, self.device, solid=solid != "never")
         self._wide = self.geometry.largest >= _FLOAT32_VOXELS * self.spacing

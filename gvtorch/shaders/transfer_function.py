@@ -157,7 +157,8 @@ class TransferFunction(Shader):
         `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
         """
         context = "TransferFunction.stretched"
-        low, high = (check.number(context, n, v) for n, v in (("low", low), ("high", high)))
+        low = check.number(context, "low", low, low=-LARGEST, high=LARGEST)
+        high = check.number(context, "high", high, low=-LARGEST, high=LARGEST)
         if not high > low:
             high = low + max(1.0, 1e-6 * abs(low))
         first, last, _ = self.corners()

@@ -132,7 +132,7 @@ def as_points(context: str, points: Points) -> Tensor:
     Raises:
         ValueError: They have another shape or dtype.
     """
-    axes = (points,) if isinstance(points, Tensor) else tuple(points)
+    axes = (points,) if isinstance(points, Tensor) or not isinstance(points, Sequence) else points
     n = len(axes)
     if isinstance(points, Tensor):
         n = points.shape[-1] if points.dim() else 0
