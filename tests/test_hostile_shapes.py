@@ -17,7 +17,7 @@ from gvtorch.shaders.shader import Sampling
 BALL = sdf.Sphere()
 TALL = ((-1, -1, -1), (1, 1, 3))
 POINTS = [[0.0, 0, 0], [1, 1, 2]]
-PLACES = torch.rand(4, 3)
+PLACES, WHOLE = torch.rand(4, 3), torch.zeros(4, 3, dtype=torch.int64)
 VOLUME = gv.Volume(torch.rand(8, 8, 8, 2))
 BYTES = np.full((4, 4, 4), 255, np.uint8)
 
@@ -70,6 +70,16 @@ def test_integers_of_numpy_are_extents():
         (lambda: sdf.Plane((1e200, 0, 0)), "Plane: normal must have a direction"),
         (lambda: sdf.rotated(BALL, (1e200, 0, 0), 90), "rotated: axis must have a direction"),
         (lambda: gv.warp(BALL, sdf.Sphere(), 0.1)(PLACES), "offset must give (..., 3) at (..., 3)"),
+        (
+            lambda: gv.FieldProducer(BALL, 8).at(WHOLE),
+            "FieldProducer.at: points must be (..., 3) fl",
+        ),
+        (lambda: gv.Hypertexture(BALL, 8, thickness=1).at(WHOLE), "at: points must be (..., 3) fl"),
+        (lambda: gv.stack(a_b=BALL, a=gv.stack(b=BALL))(PLACES), "two channels are named 'a_b'"),
+        (
+            lambda: gv.blend(gv.stack(a=BALL), gv.stack(a=BALL, b=BALL), BALL)(PLACES),
+            "Blend: both fields must have the same channels, got a and a, b",
+        ),
         (lambda: gv.stack(values=BALL), "Stack: bad name of a channel: attribute 'values' already"),
         (lambda: gv.JoinedProducer({"a.b": gv.Producer(8)}), "bad name of a channel: module name"),
         (lambda: gv.Producer(8, value_range={"value": 3}), "value_range['value'] must be (2,) num"),

@@ -153,6 +153,9 @@ class Blend(Field):
             _only_channel(evaluate(self.mask)),
         )
         if isinstance(first, Mapping) and isinstance(second, Mapping):
+            if first.keys() != second.keys():
+                names = f"{', '.join(first)} and {', '.join(second)}"
+                raise ValueError(f"Blend: both fields must have the same channels, got {names}")
             return {
                 name: _mix_values(values, second[name], fraction) for name, values in first.items()
             }
@@ -276,10 +279,13 @@ def _flatten(by_name: Mapping[str, Any]) -> dict[str, Any]:
     """Flattens channels within channels: {"a": {"b": x}} becomes {"a_b": x}."""
     flat: dict[str, Any] = {}
     for name, values in by_name.items():
-        if isinstance(values, Mapping):
-            flat |= {f"{name}_{channel}": value for channel, value in values.items()}
-        else:
-            flat[name] = values
+        inner = (
+            {f"_{n}": v for n, v in values.items()} if isinstance(values, Mapping) else {"": values}
+        )
+        channels = {name + suffix: value for suffix, value in inner.items()}
+        if taken := flat.keys() & channels.keys():
+            raise ValueError(f"Stack: two channels are named {min(taken)!r}")
+        flat |= channels
     return flat
 
 

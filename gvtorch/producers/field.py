@@ -191,7 +191,7 @@ class FieldProducer(Producer):
         dtype of the points: not filtered and not rounded. Needs no engine.
         """
         context = type(self).__name__
-        check_points(f"{context}.at", points)
+        check_points(f"{context}.at", points, floats=True)
         if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
         return _by_channel(context, _call_field(context, self.field, self.field, points), points)

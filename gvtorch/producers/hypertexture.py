@@ -170,7 +170,7 @@ class Hypertexture(EvaluationCounter, Producer):
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
-        check_points(f"{type(self).__name__}.at", points)
+        check_points(f"{type(self).__name__}.at", points, floats=True)
         if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
         distance = distances_of(type(self).__name__, self.shape, points)

@@ -488,10 +488,12 @@ class OfProducers(Producer):
             part.close()
 
 
-def check_points(context: str, points: Any) -> None:
-    """Raises ValueError unless points are (..., 3) and finite."""
-    if check.instance(context, "points", points, Tensor).shape[-1:] != (3,):
-        raise ValueError(f"{context}: points must be (..., 3), got {check.describe(points)}")
+def check_points(context: str, points: Any, *, floats: bool = False) -> None:
+    """Raises ValueError unless points are (..., 3) and finite, and floats if `floats` is true."""
+    check.instance(context, "points", points, Tensor)
+    if points.shape[-1:] != (3,) or (floats and not points.is_floating_point()):
+        wanted, got = "(..., 3) floats" if floats else "(..., 3)", check.describe(points)
+        raise ValueError(f"{context}: points must be {wanted}, got {got}")
     if not bool(torch.isfinite(points).all()):
         raise ValueError(f"{context}: points must be finite")
 
