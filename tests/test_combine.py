@@ -307,7 +307,7 @@ def test_points_to_look_at_are_checked(make):
         assert values.dtype == many[name].dtype
     for points, message in (
         ([0.0, 0.0, 0.0], "points must be a Tensor, got list"),
-        (torch.zeros(6), r"points must be (..., 3), got (6,)"),
+        (torch.zeros(6), r"points must be (..., 3)"),
         (torch.full((2, 3), torch.nan), "points must be finite"),
     ):
         with pytest.raises(ValueError) as caught:
@@ -323,3 +323,34 @@ def test_wider_nodes_are_the_same_voxels_and_more():
     assert wide.positions.shape == (3, 10, 10, 10, 3)
     assert torch.equal(wide.positions[:, 2:-2, 2:-2, 2:-2], nodes.positions)
     assert nodes.wider(2).layout is wide.layout and nodes.wider(0).layout is layout
+
+
+class Uniform(gv.Producer):
+    """Voxels of 9, but every other brick is CONSTANT 3, or EMPTY, whatever its voxels are."""
+
+    kind = gv.Region.CONSTANT
+    dtype = torch.float32
+
+    def fill(self, nodes):
+        data = torch.full((len(nodes), *(nodes.layout.side,) * 3), 9).to(self.dtype)
+        kind = torch.where(nodes.loc[:, 0] % 2 == 0, self.kind, gv.Region.DATA)
+        constants = {"value": torch.full((len(nodes), 1), 3).to(self.dtype)}
+        answer = {"constants": constants} if self.kind is gv.Region.CONSTANT else {}
+        return gv.Bricks(data={"value": data}, kind=kind, **answer)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.uint16])
+@pytest.mark.parametrize(("kind", "value"), [("CONSTANT", 3.0), ("EMPTY", 0.0)])
+def test_voxels_of_a_brick_that_turns_out_uniform_do_not_count(dtype, kind, value):
+    """Neither next to another channel's, nor in coarse levels, nor at points."""
+    uniform = Uniform(32, channels={"value": gv.Channel(dtype)})
+    uniform.kind, uniform.dtype = gv.Region[kind], dtype
+    points = torch.tensor([[3.0, 3, 3], [11.0, 3, 3]])
+    other = gv.VolumeProducer(gv.Volume(torch.rand(32, 32, 32, 1)))
+    joined = gv.JoinedProducer({"a": uniform, "b": other})
+    for producer, name in ((uniform, "value"), (joined, "a")):
+        assert producer.at(points)[name][:, 0].tolist() == [value, 9.0]
+    children = gv.FromChildren(uniform)
+    layout = Layout.of(children, 8, 1, torch.device("cpu"))
+    coarse = children.bricks_at(torch.tensor([[0, 0, 0, 1]]), layout)["value"]
+    assert coarse[0, 4, 4, [3, 6], 0].tolist() == [value, 9.0]

@@ -92,6 +92,20 @@ def test_bricks_without_parents_are_whole():
         assert (alone - bricks).abs().max() < 1e-3 and (calm - settled).abs().max() < 1e-3
 
 
+def test_octaves_may_become_coarser():
+    """With a lacunarity below 1, the octaves that settle first are the last ones."""
+    total = noise.OctaveSum(frequency=2.0**10, lacunarity=0.5, octaves=14, gain=0.9)
+    for axes, side, bricks, _ in descent(total, 9):
+        expected = direct(total, axes, side)
+        assert (bricks - expected).abs().max() < 0.01 and expected.abs().max() > 0.1
+
+
+def of_values(function):
+    return gv.OctaveProducer(noise.OctaveSum(), 8, values=lambda s, _: function(s)).at(
+        torch.ones(1, 3)
+    )
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -100,9 +114,15 @@ def test_bricks_without_parents_are_whole():
         (lambda p, c: noise.inherit(p, c, border=0), "border must be an int >= 1 and <= 4, got 0"),
         (lambda p, c: noise.inherit(p, c, points=11), "points must be an int >= 2 and <= 10"),
         (lambda p, c: noise.OctaveSum(settled=1), "settled must be >= hold, 2, got 1"),
+        (
+            lambda p, c: gv.OctaveProducer(noise.OctaveSum(), 8, values=3),
+            "values must be a function",
+        ),
+        (lambda p, c: of_values(lambda s: s.mean()), "values must return (1, 10, 10, 10), got ()"),
+        (lambda p, c: of_values(lambda s: 1.0), "values must return (1, 10, 10, 10), got float"),
     ],
 )
 def test_bad_input_gives_one_clear_line(call, message):
-    with pytest.raises(ValueError, match="noise") as error:
+    with pytest.raises(ValueError, match=r"noise|Octave") as error:
         call(torch.zeros(2, 10, 10, 10), torch.zeros(2, 3, dtype=torch.int64))
     assert message in str(error.value) and "\n" not in str(error.value)

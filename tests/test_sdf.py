@@ -83,7 +83,7 @@ def test_any_iteration_makes_a_fractal_and_what_is_not_known_is_not_proven():
     assert shape.bounds(center, half)[0] > 0, "beyond the bailout it escapes at once"
     with pytest.raises(ValueError, match="Fractal: iteration must be a Iteration, got int"):
         gv.Fractal(3)
-    with pytest.raises(ValueError, match="colors must be three colours, got 1"):
+    with pytest.raises(ValueError, match=r"colors must be \(3, 3\) numbers, got \(1, 3\)"):
         gv.Mandelbulb(colors=((0, 0, 0),))
 
 
@@ -237,3 +237,27 @@ def test_a_julia_set_takes_any_three_numbers():
     assert torch.equal(*values) and values[0].unique().numel() > 10
     with pytest.raises(ValueError, match="constant must be three numbers"):
         gv.Julia(())
+
+
+LONG = sdf.scaled(sdf.Sphere(), 4, 1, 1)  # its value rises by 1/4 per unit of length along x
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: sdf.Offset(LONG, 0.5),
+        lambda: sdf.Shell(LONG, 0.5),
+        lambda: sdf.SmoothUnion(LONG, LONG, 1.0),
+        lambda: sdf.Offset(sdf.moved(LONG, 1, 0, 1) | sdf.Sphere(), 0.5),
+        lambda: sdf.Offset(sdf.Twist(sdf.rotated(LONG, (0, 0, 1), 30), 0.5) & sdf.Sphere(4), 0.5),
+        lambda: sdf.Offset(sdf.Revolution(sdf.Extrusion(LONG, 1.0), 1.0), 0.5),
+        lambda: sdf.Offset(sdf.Repeat(LONG, (9, 0, 3), (3, 1, 1)), 0.4),
+        lambda: sdf.SmoothIntersection(sdf.Offset(LONG, 1.0), sdf.Sphere(7), 0.1),
+    ],
+)
+def test_boxes_hold_what_grows_from_stretched_shapes(make):
+    """Where space is stretched, an offset reaches farther in the world than in the value."""
+    shape, points = make(), random_points(100_000, 14.0)
+    low, high = shape.box()
+    inside = points[shape(points) < 0]
+    assert len(inside) > 20 and ((inside >= low) & (inside <= high)).all()

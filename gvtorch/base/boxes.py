@@ -56,15 +56,25 @@ def group_rows(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     return positions[starts], np.split(order, later_starts)[: len(order)]
 
 
+def extent_of(context: str, extent: int | Sequence[int]) -> tuple[int, int, int]:
+    """Returns voxels along x, y, z, given these or one number for all; ValueError otherwise."""
+    sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
+    if len(sizes) != 3:
+        raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
+    x, y, z = (check.integer(context, "extent", size, low=1, high=MAX_EXTENT) for size in sizes)
+    return x, y, z
+
+
 def extent_in(
     context: str, extent: int | Sequence[int], box: Sequence[Sequence[float]]
-) -> Sequence[int]:
+) -> tuple[int, int, int]:
     """Returns an extent (x, y, z) as it is. A single number is the extent along the box's longest
-    side; the others are chosen so that voxels are cubes, or nearly so.
+    side; the others are chosen so that voxels are cubes, or nearly so. ValueError if it is neither.
     """
-    if not isinstance(extent, int):
-        return extent
+    sizes = extent_of(context, extent)
+    if isinstance(extent, Sequence):
+        return sizes
     low, high = check.box(context, box)
-    check.integer(context, "extent", extent, low=1, high=MAX_EXTENT)
     sides = [b - a for a, b in zip(low, high, strict=True)]
-    return [max(1, round(extent * side / max(sides))) for side in sides]
+    x, y, z = (max(1, round(sizes[0] * side / max(sides))) for side in sides)
+    return x, y, z

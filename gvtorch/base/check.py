@@ -136,6 +136,13 @@ def instance(context: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
     return value
 
 
+def items(context: str, name: str, value: Any) -> tuple[Any, ...]:
+    """Returns the items of a list or another iterable; ValueError for text and anything else."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise ValueError(f"{context}: {name} must be a list, got {quoted(value)}")
+    return tuple(value)
+
+
 def text(context: str, name: str, value: Any) -> str | None:
     """Returns `value`; ValueError unless it is a str or None (`==` and `or` fail on arrays)."""
     return None if value is None else instance(context, name, value, str)
@@ -334,7 +341,7 @@ def triple(
 
 def box(context: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Returns two corners, (x, y, z) each; ValueError unless all sides are positive."""
-    if len(value) != 2:
+    if not hasattr(value, "__len__") or len(value) != 2:
         raise ValueError(f"{context}: box must be two corners, got {value!r}")
     low, high = (triple(context, "box", corner) for corner in value)
     sides = [b - a for a, b in zip(low, high, strict=True)]

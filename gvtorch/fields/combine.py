@@ -12,8 +12,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from ..base import check
 from .distance import HASH, Changed, Distance, grown
-from .field import Bounds, Field, Interval, Values, between, checked_field
+from .field import Bounds, Field, Interval, Values, between, checked_field, modules_by_name
 from .solid import Solid
 
 
@@ -33,6 +34,9 @@ class Painted(Changed):
 
     def box(self) -> Tensor | None:
         return self.shape.box()
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return self.shape.level_box(level)
 
 
 class Warp(Field):
@@ -56,6 +60,9 @@ class Warp(Field):
 
     def forward(self, points: Tensor) -> Values:
         displacement = self.offset(points)
+        if not isinstance(displacement, Tensor) or displacement.shape != points.shape:
+            got = check.describe(displacement)
+            raise ValueError(f"Warp: offset must give (..., 3) at (..., 3) points, got {got}")
         magnitude = torch.linalg.vector_norm(displacement, dim=-1, keepdim=True)
         return self.field(
             points + displacement * (self.max_offset / magnitude.clamp(min=1e-30)).clamp(max=1)
@@ -84,8 +91,8 @@ class Stack(Field):
         super().__init__()
         if not fields:
             raise ValueError("Stack: needs a field by name")
-        self.fields = nn.ModuleDict(
-            {name: checked_field("Stack", name, field) for name, field in fields.items()}
+        self.fields = modules_by_name(
+            "Stack", {name: checked_field("Stack", name, field) for name, field in fields.items()}
         )
         self.prefiltered = _prefiltered("Stack", fields.values())
 
@@ -146,6 +153,9 @@ class Blend(Field):
             _only_channel(evaluate(self.mask)),
         )
         if isinstance(first, Mapping) and isinstance(second, Mapping):
+            if first.keys() != second.keys():
+                names = f"{', '.join(first)} and {', '.join(second)}"
+                raise ValueError(f"Blend: both fields must have the same channels, got {names}")
             return {
                 name: _mix_values(values, second[name], fraction) for name, values in first.items()
             }
@@ -269,10 +279,13 @@ def _flatten(by_name: Mapping[str, Any]) -> dict[str, Any]:
     """Flattens channels within channels: {"a": {"b": x}} becomes {"a_b": x}."""
     flat: dict[str, Any] = {}
     for name, values in by_name.items():
-        if isinstance(values, Mapping):
-            flat |= {f"{name}_{channel}": value for channel, value in values.items()}
-        else:
-            flat[name] = values
+        inner = (
+            {f"_{n}": v for n, v in values.items()} if isinstance(values, Mapping) else {"": values}
+        )
+        channels = {name + suffix: value for suffix, value in inner.items()}
+        if taken := flat.keys() & channels.keys():
+            raise ValueError(f"Stack: two channels are named {min(taken)!r}")
+        flat |= channels
     return flat
 
 

@@ -13,7 +13,7 @@ Sources: Hart, "Sphere tracing: a geometric method for the antialiased ray traci
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from .field import Field, Interval, between, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
 WHITE = (0.8, 0.8, 0.8)
-HASH = 0x9E3779B1
+HASH = 0x9E3779B1  # odd factor by which `alike` combines the numbers of parts
 _ROUNDING = 2.0**-16  # times the size of coordinates: rounding in float32 changes values by less
 
 
@@ -40,15 +40,12 @@ class Distance(Field):
 
     exact: bool = True
     smooth: bool = True
+    color: Tensor  # (3,) float64
 
     def __init__(self, color: Color = WHITE) -> None:
         """Sets the colour of the surface."""
         super().__init__()
-        context = type(self).__name__
-        red, green, blue = check.triple(context, "color", color)
-        if min(red, green, blue) < 0 or max(red, green, blue) > 1:
-            raise ValueError(f"{context}: color must be in 0 to 1, got {tuple(color)}")
-        self.color = self.vector("color", (red, green, blue))
+        self.register_buffer("color", checked_colors(type(self).__name__, "color", color, (3,)))
 
     def forward(self, points: Tensor) -> Tensor:
         """Returns (...,) signed distances at points (..., 3)."""
@@ -82,6 +79,13 @@ class Distance(Field):
     def near(self, center: Tensor, half: Tensor) -> Distance:
         return self
 
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        """Returns (2, 3) float64 corners of a box outside which the value exceeds a level >= 0;
+        None: unknown. Unless overridden, this is `box` grown by the level, which is right if the
+        value is at least the distance from `box`.
+        """
+        return grown(self.box(), level)
+
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """Returns intervals (k, 3) float64 that hold the colours everywhere in boxes."""
         color = self.color.to(center).expand_as(center)
@@ -98,7 +102,9 @@ class Distance(Field):
 
 
 class Pair(Distance):
-    """Base of combinations of two shapes by `mix`, which must not decrease with either value."""
+    """Base of combinations of two shapes by `mix`, which must not decrease with either value. A
+    subclass whose value may be less than both overrides `level_box`, as `SmoothUnion` does.
+    """
 
     def __init__(self, first: Distance, second: Distance) -> None:
         """Sets the shapes, which keep their colours."""
@@ -173,7 +179,10 @@ class Pair(Distance):
         return (first * HASH + second) * 3 + relevance
 
     def box(self) -> Tensor | None:
-        return joint_box(self.first.box(), self.second.box())
+        return self.level_box(0.0)
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return joint_box(self.first.level_box(level), self.second.level_box(level))
 
 
 class Union(Pair):
@@ -189,8 +198,8 @@ class Intersection(Pair):
     def mix(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
         return torch.maximum(first, second), second > first
 
-    def box(self) -> Tensor | None:
-        return common_box(self.first.box(), self.second.box())
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return common_box(self.first.level_box(level), self.second.level_box(level))
 
 
 class SmoothUnion(Pair):
@@ -206,8 +215,8 @@ class SmoothUnion(Pair):
         weight = (0.5 + 0.5 * (first - second) / self.width).clamp(0, 1)
         return torch.lerp(first, second, weight) - self.width * weight * (1 - weight), weight
 
-    def box(self) -> Tensor | None:
-        return grown(super().box(), self.width / 4)
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return super().level_box(level + self.width / 4)
 
 
 class OfShape(Field):
@@ -287,8 +296,11 @@ class SmoothIntersection(Negative):
         self._parts = (first, second)
 
     def box(self) -> Tensor | None:
+        return self.level_box(0.0)
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
         first, second = self._parts
-        return common_box(first.box(), second.box())
+        return common_box(first.level_box(level), second.level_box(level))
 
 
 class SmoothDifference(SmoothIntersection):
@@ -298,6 +310,14 @@ class SmoothDifference(SmoothIntersection):
         """Sets the shapes and the width of the blend, see `SmoothUnion`."""
         check.instance("SmoothDifference", "second", second, Distance)
         super().__init__(first, Negative(second), width)
+
+
+def checked_colors(context: str, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
+    """Returns float64 colours of a shape; ValueError unless all their numbers are in [0, 1]."""
+    colors = check.reals(context, name, value, shape)
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise ValueError(f"{context}: {name} must be in 0 to 1, got {check.quoted(value)}")
+    return colors
 
 
 def joint_box(first: Tensor | None, second: Tensor | None) -> Tensor | None:

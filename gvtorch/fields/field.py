@@ -76,7 +76,8 @@ class Field(nn.Module):
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor) -> Bounds:
         """Returns intervals that hold the means over all voxels within the boxes, of sides `size`
-        (k, 3) float64 or smaller. By default those of `bounds`, which hold for means as well.
+        (k, 3) float64 or smaller; if there is a margin, what `finish` returns there. By default
+        those of `bounds`, which hold for means as well.
         """
         return self.bounds(center, half)
 
@@ -159,6 +160,23 @@ def checked_field(context: str, name: str, value: Any) -> nn.Module:
     if hasattr(field, "classify"):
         reason = ", a producer: give its field, or put producers side by side by gv.JoinedProducer"
     raise ValueError(f"{context}: {name} must be a field, got {kind}{reason}")
+
+
+def modules_by_name(context: str, parts: Mapping[str, nn.Module]) -> nn.ModuleDict:
+    """Returns modules by the names of channels; ValueError for a name that torch refuses."""
+    try:
+        return nn.ModuleDict(parts)
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{context}: bad name of a channel: {error.args[0]}") from None
+
+
+def unit_vector(context: str, name: str, value: Sequence[float] | Tensor) -> Tensor:
+    """Returns (3,) float64 a user's direction, of length 1; ValueError if it has no length."""
+    vector = torch.tensor(check.triple(context, name, value), dtype=torch.float64)
+    norm = vector.norm()
+    if not 0 < float(norm) < math.inf:
+        raise ValueError(f"{context}: {name} must have a direction, got {tuple(value)}")
+    return vector / norm
 
 
 def length(vectors: Tensor) -> Tensor:

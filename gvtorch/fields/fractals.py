@@ -17,6 +17,7 @@ Sources: those of ops/reference/orbits.py, which follows the orbits; Pickover, "
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TypedDict, Unpack
 
@@ -26,7 +27,7 @@ from torch import Tensor, nn
 from .. import ops
 from ..base import check
 from ..ops.reference import orbits as twin
-from .distance import Color, Distance
+from .distance import Color, Distance, checked_colors
 from .field import Interval, joined, length, parts_of
 
 _PARTS = 2  # parts of a box along each axis; more would cost as much as the bricks they save
@@ -142,11 +143,7 @@ class Fractal(Distance):
         self.bailout = self.number("bailout", bailout, low=1, open_low=True)
         self.julia = constant is not None
         self.constant = self.vector("constant", (0.0, 0.0, 0.0) if constant is None else constant)
-        if len(colors) != 3:
-            raise ValueError(f"{context}: colors must be three colours, got {len(colors)}")
-        self.register_buffer(
-            "colors_33", check.reals(context, "colors", colors, (3, 3)).clamp(0, 1)
-        )
+        self.register_buffer("colors_33", checked_colors(context, "colors", colors, (3, 3)))
 
     def forward(self, points: Tensor) -> Tensor:
         return self._orbits(points)[0]
@@ -241,14 +238,16 @@ class Julia(Fractal):
         power: int = 2,
         **settings: Unpack[OrbitSettings],
     ) -> None:
-        """Takes the constant, n, and the arguments of `Fractal`."""
+        """Takes the constant, at most 10^20 long, n, and the arguments of `Fractal`."""
         super().__init__(Power(power), constant=constant, **settings)
+        check.number("Julia", "length of the constant", self.constant.norm(), high=1e20)
 
     def box(self) -> Tensor:
         """Returns a cube of half side R >= 1 with R^n - |c| > R: all points beyond R escape."""
         power = self.iteration.power
         assert isinstance(power, int)
-        radius, constant_norm = 1.0, float(self.constant.norm())
+        constant_norm = float(self.constant.norm())
+        radius = max(1.0, math.floor(constant_norm ** (1 / power)))  # not yet large enough
         while radius**power - constant_norm <= radius:
             radius += 1 / 64
         return self._cube(radius)
@@ -262,7 +261,7 @@ class Mandelbox(Fractal):
         step = Fold(scale)
         settings.setdefault("bailout", 1.8 * step.side)  # corners are sqrt(3) = 1.73 `side` away
         super().__init__(step, **settings)
-        self._side = step.side + 2 * float(self.bailout) / abs(step.scale) ** self.iterations
+        self._side = step.side + 2 * float(self.bailout) * abs(step.scale) ** -self.iterations
 
     def box(self) -> Tensor:
         """Returns the cube that holds all orbits that never escape, a little enlarged for those

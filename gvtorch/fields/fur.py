@@ -13,12 +13,14 @@ from torch import Tensor
 
 from ..base import check
 from . import noise
-from .distance import Distance, OfShape, grown
+from .distance import Distance, OfShape
 from .field import Interval, length
+from .noise.fractal import MOST_SEED
 
 _SKIN_VALUE = 0.1  # value of skin and roots
 # Height at which hairs end, in lengths: mean + spread * noise.
 _MEAN_HEIGHT, _HEIGHT_SPREAD = 0.45, 0.7
+_MAX_SPREAD = _HEIGHT_SPREAD * noise.bounds(noise.perlin).high
 _END_SLOPE = 5.0  # slope with which a hair ends: from 1 to 0 within 1 / 5 of a length
 
 
@@ -56,7 +58,7 @@ class Fur(OfShape):
         self.length = self.number("length", length, low=0, open_low=True)
         self.frequency = self.number("frequency", frequency, low=0, open_low=True)
         self.fall = self.vector("fall", fall)
-        self.seed = check.integer("Fur", "seed", seed, low=-(2**62), high=2**62)
+        self.seed = check.integer("Fur", "seed", seed, low=-MOST_SEED, high=MOST_SEED)
 
     def forward(self, points: Tensor) -> Mapping[str, Tensor]:
         return self.filtered(points, torch.zeros_like(points))
@@ -76,13 +78,11 @@ class Fur(OfShape):
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
         """Returns 0 above all hairs, the skin's value below all roots, else 0 to 1."""
         low, high = self.shape.bounds(center, half)
-        spread = _HEIGHT_SPREAD * noise.bounds(noise.perlin).high
-        above = low > (_MEAN_HEIGHT + spread) * self.length
-        skin = high < (_MEAN_HEIGHT - spread - 1 / _END_SLOPE) * self.length
+        above = low > (_MEAN_HEIGHT + _MAX_SPREAD) * self.length
+        skin = high < (_MEAN_HEIGHT - _MAX_SPREAD - 1 / _END_SLOPE) * self.length
         skin_value = _SKIN_VALUE * skin.to(low)
         return {"value": (skin_value, torch.where(skin, skin_value, (~above).to(low)))}
 
     def box(self) -> Tensor | None:
         """Returns the box around the shape and its hairs."""
-        max_height = _MEAN_HEIGHT + _HEIGHT_SPREAD * noise.bounds(noise.perlin).high
-        return grown(self.shape.box(), max_height * self.length)
+        return self.shape.level_box((_MEAN_HEIGHT + _MAX_SPREAD) * self.length)

@@ -22,6 +22,7 @@ from ..meshes.voxelizer import Voxelizer
 from .distance import WHITE, Color, Distance
 from .field import Interval, length
 
+_SPREAD_BYTES = 32  # bytes a voxel that `_spread` takes at least
 _BAND = 3.0  # voxels around a mesh in which distances are computed from its triangles
 
 
@@ -29,7 +30,10 @@ class SampledDistance(Distance):
     """Distances interpolated between voxels. Beyond the box of the voxel centres, the distance to
     this box is added to the value at its nearest point.
 
-    Args of the constructor: `volume`, one number a voxel, world units, negative inside.
+    Attributes:
+        values: (z, y, x) float32 distances, world units.
+        steepest: () float64 largest slope of an interpolated value.
+        apart: () float64 most that two voxels differ per unit of length between them.
     """
 
     exact = False
@@ -38,7 +42,12 @@ class SampledDistance(Distance):
     apart: Tensor
 
     def __init__(self, volume: Volume, *, color: Color = WHITE) -> None:
-        """Sets the volume, whose position in the world is the field's. float32 data is not copied.
+        """Sets the volume, whose position in the world is the field's.
+
+        Args:
+            volume: One number a voxel: signed distance in world units, negative inside. float32
+                data is not copied.
+            color: The surface's, linear red, green, blue.
 
         Raises:
             ValueError: It does not have one number a voxel, or has less than 2 voxels on an axis.
@@ -92,6 +101,8 @@ class SampledDistance(Distance):
         grid = Voxelizer(mesh, resolution=resolution, **settings)
         margin = math.ceil(reach * resolution)
         ends = [n + margin for n in grid.extent[::-1]]
+        nbytes = _SPREAD_BYTES * math.prod(n + margin for n in ends)
+        check.memory("SampledDistance", f"resolution {resolution}", nbytes, torch.device("cpu"))
         near_surface = grid.region((-margin,) * 3, ends)["distance"][..., 0]
         values = grid.spacing * _spread(near_surface / grid.spacing)
         origin = [coordinate - margin * grid.spacing for coordinate in grid.origin]
@@ -105,7 +116,9 @@ class SampledDistance(Distance):
         cell = torch.minimum(clamped.floor(), self.last.to(position) - 1)
         weights = clamped - cell
         _, y, x = self.values.shape
-        base_index = cell.to(torch.int64)
+        base_index = cell.nan_to_num().to(
+            torch.int64
+        )  # points that are NaN get values that are NaN
         base_index = (base_index[..., 2] * y + base_index[..., 1]) * x + base_index[..., 0]
         flat = self.values.reshape(-1)
         corners = [

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import WHITE, Color, Distance
-from .field import Interval, box_distance, length
+from .field import Interval, box_distance, length, unit_vector
 
 
 class Sphere(Distance):
@@ -114,6 +114,8 @@ class Capsule(Distance):
 class Plane(Distance):
     """The half-space below a plane: on the side opposite to its normal."""
 
+    normal: Tensor
+
     def __init__(
         self,
         normal: Sequence[float] = (0.0, 0.0, 1.0),
@@ -123,10 +125,7 @@ class Plane(Distance):
     ) -> None:
         """Takes the normal, of any length but 0, and the plane's height along it."""
         super().__init__(color)
-        self.normal = self.vector("normal", normal)
-        if not float(self.normal.norm()) > 0:
-            raise ValueError(f"Plane: normal must have a direction, got {tuple(normal)}")
-        self.normal /= self.normal.norm()
+        self.register_buffer("normal", unit_vector("Plane", "normal", normal))
         self.height = self.number("height", height)
 
     def forward(self, points: Tensor) -> Tensor:

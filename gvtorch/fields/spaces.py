@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from .distance import Changed, Distance, grown
-from .field import Interval, box_distance, length, tighter
+from .field import Interval, box_distance, length, tighter, unit_vector
 
 Matrix = Sequence[Sequence[float]]
 
@@ -29,7 +29,10 @@ class Space(Changed):
         return points
 
     def value(self, value: Tensor, points: Tensor) -> Tensor:
-        """Returns the value at points, given the shape's; must not decrease as that grows."""
+        """Returns the value at points, given the shape's; must not decrease as that grows. `bounds`
+        calls it for the centres of boxes, so a subclass whose value also depends on points
+        overrides `bounds`.
+        """
         return value
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor | float:
@@ -51,6 +54,21 @@ class Space(Changed):
         low, high = super().bounds(center, half)
         mapped_bounds = self.value(low, center), self.value(high, center)
         return tighter(mapped_bounds, Distance.bounds(self, center, half))
+
+    def around(self, box: Tensor) -> Tensor | None:
+        """Returns a (2, 3) box around the deformed shape, given one around the shape; None: unknown
+        unless overridden.
+        """
+        return None
+
+    def box(self) -> Tensor | None:
+        box = self.shape.box()
+        return None if box is None else self.around(box)
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        box = None if self.shape.exact else self.shape.level_box(level)
+        box = None if box is None else self.around(box)
+        return super().level_box(level) if box is None else box
 
 
 class Transform(Space):
@@ -93,10 +111,14 @@ class Transform(Space):
     def value(self, value: Tensor, points: Tensor) -> Tensor:
         return value * self.scale
 
-    def box(self) -> Tensor | None:
-        box = self.shape.box()
-        if box is None:
-            return None
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        """Where the matrix stretches, the value rises by less than 1 per unit of length."""
+        if self.exact:
+            return grown(self.box(), level)
+        box = self.shape.level_box(level / self.scale)
+        return None if box is None else self.around(box)
+
+    def around(self, box: Tensor) -> Tensor:
         matrix = torch.linalg.inv(self.inverse)
         middle, half = box.mean(0) @ matrix.mT, (box[1] - box[0]) / 2 @ matrix.abs().mT
         return torch.stack((middle - half, middle + half)) + self.offset
@@ -130,10 +152,7 @@ class Twist(Space):
         shear = self.rate.abs() * length((center.abs() + half)[:, :2])
         return (shear + (shear * shear + 4).sqrt()) / 2
 
-    def box(self) -> Tensor | None:
-        box = self.shape.box()
-        if box is None:
-            return None
+    def around(self, box: Tensor) -> Tensor:
         radius = length(box.abs().amax(0)[:2])
         low, high = box.unbind(0)
         return torch.stack(
@@ -168,7 +187,9 @@ class Repeat(Space):
         if beyond is None or bool((beyond[self._axes] > 1e-9).any()):
             size = "no box" if box is None else f"box {box.tolist()}"
             raise ValueError(f"{context}: the shape must lie within its cell, it has {size}")
-        counts = (None,) * 3 if count is None else tuple(count)
+        if count is not None and (not isinstance(count, Sequence) or len(count) != 3):
+            raise ValueError(f"{context}: count must be (x, y, z), got {count!r}")
+        counts = count or (None,) * 3
         for axis_count in counts:
             if (
                 axis_count is not None
@@ -219,9 +240,9 @@ class Repeat(Space):
             high = torch.where(torch.arange(3, device=low.device) == axis, ends[1][:, None], high)
         return (low + high) / 2, (high - low) / 2
 
-    def box(self) -> Tensor | None:
+    def around(self, box: Tensor) -> Tensor | None:
         max_cell = self.period.new_tensor(self._max_cell, dtype=torch.float64)
-        return grown(self.shape.box(), torch.where(self.period > 0, self.period * max_cell, 0.0))
+        return grown(box, torch.where(self.period > 0, self.period * max_cell, 0.0))
 
 
 class Offset(Space):
@@ -236,7 +257,10 @@ class Offset(Space):
         return value - self.by
 
     def box(self) -> Tensor | None:
-        return grown(self.shape.box(), self.by.clamp(min=0))
+        return self.level_box(0.0)
+
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        return self.shape.level_box((level + self.by).clamp(min=0))
 
 
 class Shell(Offset):
@@ -289,10 +313,7 @@ class Extrusion(Space):
         """Returns the shape's slope, but at least 1, that of the caps."""
         return super().slope(center, half).clamp(min=1)
 
-    def box(self) -> Tensor | None:
-        box = self.shape.box()
-        if box is None:
-            return None
+    def around(self, box: Tensor) -> Tensor:
         ends = torch.stack((-self.height, self.height)) / 2
         return torch.cat((box[:, :2], ends[:, None]), 1)
 
@@ -323,10 +344,7 @@ class Revolution(Space):
         middle = torch.stack(((near + far) / 2 - self.radius, center[:, 2], zero), 1)
         return middle, torch.stack(((far - near) / 2, half[:, 2], zero), 1)
 
-    def box(self) -> Tensor | None:
-        box = self.shape.box()
-        if box is None:
-            return None
+    def around(self, box: Tensor) -> Tensor:
         radius = self.radius + box[:, 0].abs().max()
         return torch.stack(
             (torch.stack((-radius, -radius, box[0, 1])), torch.stack((radius, radius, box[1, 1])))
@@ -346,11 +364,8 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
     Raises:
         ValueError: The axis has no direction, or a number is not finite.
     """
-    direction = torch.tensor(check.triple("rotated", "axis", axis), dtype=torch.float64)
-    if not float(direction.norm()) > 0:
-        raise ValueError(f"rotated: axis must have a direction, got {tuple(axis)}")
+    x, y, z = unit_vector("rotated", "axis", axis).tolist()
     angle = math.radians(check.number("rotated", "degrees", degrees))
-    x, y, z = (direction / direction.norm()).tolist()
     cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64)
     matrix = torch.eye(3).double() + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     return Transform(shape, matrix)

@@ -14,7 +14,7 @@ from ..ops.voxelize import ARITY, Voxelized, voxelize
 from .mesh import Mesh, solids
 
 _MORTON_BITS = 20  # bits of a Morton code along each axis
-_HALF_DIAGONAL = 0.5 * 3**0.5  # half the diagonal of a unit cube
+HALF_DIAGONAL = 0.5 * 3**0.5  # from a unit cube's centre to its corner
 _BATCH_POINTS = 1 << 20  # points per call of the op
 
 
@@ -116,7 +116,7 @@ class Geometry:
             part; and, of the same shape, whether such a part lies inside the mesh.
         """
         part_size = size_k / parts
-        reach = (reach_k + _HALF_DIAGONAL * part_size) * (1 + 1e-3)  # exceeds float32's rounding
+        reach = (reach_k + HALF_DIAGONAL * part_size) * (1 + 1e-3)  # exceeds float32's rounding
         size = torch.stack((part_size, part_size, reach), 1)
         voxels = self.cubes(low_k3, size, parts, wide=wide)
         return voxels.nearest >= 0, voxels.winding != 0

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..base import check
+
 _MIN_SIZE = 1e-30  # world size of a mesh; 1 / _MIN_SIZE is the largest: squares are finite, not 0
 _WELD_STEPS = 2.0**40  # steps along a mesh's longest side; vertices that round alike are merged
 MOST_FACES = 2**28  # most triangles of a mesh: with their hierarchy, they would take 100 GB
@@ -18,6 +20,18 @@ class Material:
     name: str = ""
     color: tuple[float, float, float, float] = (0.8, 0.8, 0.8, 1.0)  # linear RGB, opacity
     texture: np.ndarray | None = field(default=None, repr=False)  # (h, w, 4) uint8, sRGB; row 0 top
+
+    def __post_init__(self) -> None:
+        """Raises ValueError if a field has the wrong shape or dtype, or a colour is not finite."""
+        check.reals(f"material {self.name!r}", "color", self.color, (4,))
+        texture = self.texture
+        if texture is not None and not (
+            isinstance(texture, np.ndarray)
+            and (texture.ndim, texture.shape[2:], texture.dtype) == (3, (4,), np.uint8)
+            and texture.size
+        ):
+            got = check.as_text(texture)
+            raise ValueError(f"material {self.name!r}: texture must be (h, w, 4) uint8, got {got}")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,17 +52,18 @@ class Mesh:
 
     def __post_init__(self) -> None:
         """Checks and converts the fields."""
-        count = len(np.asarray(self.faces))
-        for field_name, shape, dtype in (
-            ("vertices", (None, 3), np.float64),
-            ("faces", (None, 3), np.int64),
-            ("color", (count, 3, 4), np.float32),
-            ("uv", (count, 3, 2), np.float32),
-            ("material", (count,), np.int64),
+        count = None  # of faces, which come first
+        for field_name, row_shape, dtype in (
+            ("faces", (3,), np.int64),
+            ("vertices", (3,), np.float64),
+            ("color", (3, 4), np.float32),
+            ("uv", (3, 2), np.float32),
+            ("material", (), np.int64),
         ):
             value = getattr(self, field_name)
-            if value is None:
+            if value is None and field_name not in ("faces", "vertices"):
                 continue
+            shape = (None if field_name == "vertices" else count, *row_shape)
             expected_shape = ", ".join("n" if n is None else str(n) for n in shape)
             try:
                 array = np.asarray(value)
@@ -69,6 +84,7 @@ class Mesh:
                     f"{self.name}: {field_name} must be ({expected_shape}), got {value.shape}"
                 )
             object.__setattr__(self, field_name, value)
+            count = len(self.faces)
         if self.material is None:
             object.__setattr__(self, "material", np.zeros(count, np.int64))
         self._check()
@@ -90,6 +106,8 @@ class Mesh:
         if bad:
             raise ValueError(f"{self.name}: {bad} corners of triangles are NaN or infinite")
         assert self.material is not None
+        for entry in check.items(self.name, "materials", self.materials):
+            check.instance(self.name, "each of materials", entry, Material)
         low, high = int(self.material.min()), int(self.material.max())
         if low < 0 or high >= len(self.materials):
             bad_index = low if low < 0 else high

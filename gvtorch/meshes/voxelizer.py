@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from ..ops.voxelize import Voxelized
-from .geometry import Geometry
+from .geometry import HALF_DIAGONAL, Geometry
 from .holes import SolidParts, filled
 from .mesh import Mesh
 from .paint import Paint
@@ -27,12 +27,12 @@ CHANNELS = {
     "normal": (torch.int8, 3),
     "material": (torch.uint8, 1),
 }
+_MOST_VOXELS = 2**30  # most voxels along a side, and of a length in voxels
 _MARGIN_VOXELS = 2  # voxels around the mesh
 # Voxels along a cube's side; cubes along the side of a block of a region.
 _CUBE_VOXELS, _BLOCK_CUBES = 8, 4
 _BATCH_VOXELS = 1 << 20  # voxels that are computed together
 _SAMPLES_PER_SIDE = 2  # samples along a side of a coarse voxel, which is their mean
-_HALF_DIAGONAL = 0.5 * math.sqrt(3)  # from a voxel's centre to its corner
 _FLOAT32_VOXELS = 2048.0  # size of a triangle, in voxels, from which on float64 is used
 
 
@@ -47,7 +47,7 @@ class GridSettings(TypedDict, total=False):
 
 def check_channels(context: str, channels: str | Sequence[str]) -> tuple[str, ...]:
     """Returns the names as a tuple; ValueError if there are none, or unknown or repeated ones."""
-    names = (channels,) if isinstance(channels, str) else tuple(channels)
+    names = (channels,) if isinstance(channels, str) else check.items(context, "channels", channels)
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):
         rejected = f"{unknown[0]!r}" if unknown else f"{names!r}"
@@ -108,7 +108,7 @@ class Voxelizer:
             ValueError: An unknown channel, or a number out of its range.
         """
         context = "voxelize"
-        check.integer(context, "resolution", resolution, low=8, high=2**30)
+        check.integer(context, "resolution", resolution, low=8, high=_MOST_VOXELS)
         check.one_of(context, "solid", solid, get_args(SolidParts))
         channels = check_channels(context, channels)
         if solid == "always":
@@ -135,8 +135,9 @@ class Voxelizer:
         middle, half_extent = 0.5 * (low + high), [0.5 * (n - 1) * self.spacing for n in counts]
         x, y, z = (float(m - h) for m, h in zip(middle, half_extent, strict=True))
         self.origin = (x, y, z)
-        self.band = check.number(context, "band", band, low=2) * self.spacing
-        self.thickness = check.number(context, "thickness", thickness, low=0.1) * self.spacing
+        band = check.number(context, "band", band, low=2, high=_MOST_VOXELS)
+        thickness = check.number(context, "thickness", thickness, low=0.1, high=_MOST_VOXELS)
+        self.band, self.thickness = band * self.spacing, thickness * self.spacing
         self.device = torch.device(device)
         self.geometry = Geometry(mesh, self.device, solid=solid != "never")
         self._wide = self.geometry.largest >= _FLOAT32_VOXELS * self.spacing
@@ -149,7 +150,7 @@ class Voxelizer:
 
     def reach(self, voxel_k: Tensor) -> Tensor:
         """Returns (k,) the world distance up to which triangles affect voxels of sizes (k,)."""
-        distance = (_HALF_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
+        distance = (HALF_DIAGONAL * voxel_k + 0.5 * self.thickness) * (1 + 1e-6)
         return distance if {"coverage"} == {*self.channels} else distance.clamp(min=self.band)
 
     def touched(self, low_k3: Tensor, size_k: Tensor, voxel_k: Tensor) -> tuple[Tensor, Tensor]:

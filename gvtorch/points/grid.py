@@ -14,7 +14,7 @@ import torch
 
 from ..base import check
 from ..base.boxes import extent_in
-from ..base.constants import MAX_BRANCHING, MAX_EXTENT
+from ..base.constants import MAX_BRANCHING
 from ..ops.splat import shares
 from .points import Points
 
@@ -87,11 +87,7 @@ class PointGrid:
         """Returns the grid of a user's extent and box; without a box, one around all points."""
         check.integer(context, "branching", branching, low=2, high=MAX_BRANCHING)
         low, high = check.box(context, _bounds(blocks) if box is None else box)
-        extent = extent_in(context, extent, (low, high))
-        if len(extent) != 3:
-            raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.integer(context, "extent", n, low=1, high=MAX_EXTENT) for n in extent)
-        return cls((x, y, z), low, high, branching)
+        return cls(extent_in(context, extent, (low, high)), low, high, branching)
 
     @property
     def spacing_3(self) -> np.ndarray:

@@ -323,9 +323,8 @@ class _Sorter:
         size = self.grid.spacing_3 * n
         position, radius = rows["position"].astype(np.float64), rows["radius"].astype(np.float64)
         voxel = np.floor((position - self.grid.low) / size).astype(np.int64)
-        radius_voxels = min(
-            int(np.ceil(radius.max() / size.min())), math.ceil(max(self.grid.extent) / n)
-        )
+        most = math.ceil(max(self.grid.extent) / n)
+        radius_voxels = math.ceil(min(float(radius.max()), most * size.min()) / size.min())
         count = 2 * radius_voxels + 1
         first = voxel - radius_voxels
         narrow = radius == 0  # wholly in its voxel

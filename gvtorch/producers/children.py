@@ -234,17 +234,11 @@ class FromChildren(OfProducers):
         """Returns the producer's voxels of finest nodes, without borders."""
         bricks, border = self._producer_bricks(nodes), nodes.layout.border
         raise_first(bricks.errors)
-        size = nodes.layout.brick_size
-        voxels = _uniform(self, bricks.constants, len(nodes), size)
-        inner = slice(border, border + size)
-        data = torch.ones(len(nodes), dtype=torch.bool)
-        if bricks.kind is not None:
-            kind = bricks.kind.cpu()
-            data = (kind != Region.EMPTY) & (kind != Region.CONSTANT)
-        for name, rows in bricks.data.items():
-            values = to_numpy(on_device(rows, torch.device("cpu")))
-            voxels[name][data.numpy()] = values[data.numpy(), inner, inner, inner]
-        return voxels
+        inner, cpu = slice(border, border + nodes.layout.brick_size), torch.device("cpu")
+        return {
+            name: to_numpy(on_device(bricks.voxels(name), cpu))[:, inner, inner, inner]
+            for name in bricks.data
+        }
 
 
 def _uniform(

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
-from ..base.boxes import extent_in
-from ..base.constants import DEEP_VOXELS, MAX_EXTENT
+from ..base.boxes import extent_in, extent_of
+from ..base.constants import DEEP_VOXELS
 from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
+from .nodes import ROUNDING_VOXELS
 from .producer import Bricks, Nodes, Producer, Region, Regions, check_points, clocks_of
 
 _BATCH_BRICKS = 64  # made at a time on the CPU, so that intermediate values fit into its caches
 _MIN_GROUP_BRICKS = 12  # smaller groups cost more than leaving out parts of a field saves
-_MARGIN_VOXELS = 1 / 32  # voxels by which boxes are widened, so that they contain rounded positions
 _ROUNDING = 2.0**-18  # relative widening of intervals, because values are rounded too
 
 
@@ -130,10 +130,7 @@ class FieldProducer(Producer):
         """Returns EMPTY where all channels that have a threshold are proven not to exceed it, else
         CONSTANT where all channels are proven uniform, else DATA; and the known ranges of values.
         """
-        layout = nodes.layout
-        size = nodes.voxel_size
-        half_extent = size * (0.5 * layout.brick_size + layout.border + _MARGIN_VOXELS)
-        bounds = self._bounds(nodes.center, half_extent, size)
+        bounds = self._bounds(nodes.center, nodes.half_extent(), nodes.voxel_size)
         one_value = empty = torch.zeros_like(nodes.depth, dtype=torch.bool)
         if len(bounds) == len(self.channels):
             one_value = torch.stack([(high == low).all(1) for low, high in bounds.values()]).all(0)
@@ -187,14 +184,14 @@ class FieldProducer(Producer):
     @property
     def _margin_voxels(self) -> float:
         """Voxels beyond a brick's border in which the field is evaluated, and a rounding margin."""
-        return getattr(self.field, "margin", 0) + _MARGIN_VOXELS
+        return getattr(self.field, "margin", 0) + ROUNDING_VOXELS
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the field's own values at points (..., 3), for each channel (..., c), in the
         dtype of the points: not filtered and not rounded. Needs no engine.
         """
         context = type(self).__name__
-        check_points(f"{context}.at", points)
+        check_points(f"{context}.at", points, floats=True)
         if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
         return _by_channel(context, _call_field(context, self.field, self.field, points), points)
@@ -298,8 +295,7 @@ def group_alike(
     if not isinstance(field, Field):
         yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
         return
-    center, layout = nodes.center, nodes.layout
-    half_extent = nodes.voxel_size * (0.5 * layout.brick_size + layout.border + margin)
+    center, half_extent = nodes.center, nodes.half_extent(margin)
     name, part_keys = type(field).__name__, field.alike(center, half_extent)
     if check.as_text(part_keys) != f"({len(nodes)},) int64":
         got = check.describe(part_keys)
@@ -392,7 +388,7 @@ def _grid(
     field: Field | None,
     extent: int | Sequence[int],
     box: Sequence[Sequence[float]] | None,
-) -> tuple[Any, Any]:
+) -> tuple[tuple[int, int, int], Sequence[Sequence[float]]]:
     """Returns extent and box of the grid in `box`, or around a field's box, 2 voxels wider on each
     side.
     """
@@ -403,14 +399,16 @@ def _grid(
         raise ValueError(f"{context}: box must be given: the field does not say where it ends")
     around = around.cpu()
     sides, middle = around[1] - around[0], around.mean(0)
-    if isinstance(extent, int):
-        check.integer(context, "extent", extent, low=5, high=MAX_EXTENT)
-        voxel = sides.max() / (extent - 4)
-        extent = [math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides]
-        half_size = torch.tensor(extent, dtype=torch.float64) * voxel / 2
+    sizes = extent_of(context, extent)
+    if isinstance(extent, Sequence):
+        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in sizes]))
     else:
-        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in extent]))
-    return extent, ((middle - half_size).tolist(), (middle + half_size).tolist())
+        check.integer(context, "extent", extent, low=5)
+        voxel = sides.max() / (sizes[0] - 4)
+        x, y, z = (math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides)
+        sizes = x, y, z
+        half_size = torch.tensor(sizes, dtype=torch.float64) * voxel / 2
+    return sizes, ((middle - half_size).tolist(), (middle + half_size).tolist())
 
 
 def position_dtype(box: Sequence[Sequence[float]], spacing: Sequence[float]) -> torch.dtype:

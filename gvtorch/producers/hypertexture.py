@@ -108,12 +108,12 @@ class Hypertexture(EvaluationCounter, Producer):
         peak = amplitude * sum(o.amplitude for o in series) * noise.bounds(noise.perlin).high
         max_offset = thickness * max(peak + softness - 0.5, 0.0)
         if box is None:
-            shape_box = shape.box()
-            if shape_box is None or not bool(shape_box.isfinite().all()):
+            around = shape.level_box(max_offset)
+            if around is None or not bool(around.isfinite().all()):
                 raise ValueError(
                     f"{context}: box must be given: the shape does not say where it ends"
                 )
-            box = [(shape_box[0] - max_offset).tolist(), (shape_box[1] + max_offset).tolist()]
+            box = around.tolist()
         extent = extent_in(context, extent, box)
         check.float_dtype(context, dtype)
         channels = {"density": Channel(dtype)}
@@ -170,7 +170,7 @@ class Hypertexture(EvaluationCounter, Producer):
 
     def at(self, points: Tensor) -> dict[str, Tensor]:
         """Returns the channels (..., 1) at points (..., 3), of the points' dtype, not filtered."""
-        check_points(f"{type(self).__name__}.at", points)
+        check_points(f"{type(self).__name__}.at", points, floats=True)
         if points.dim() == 1:  # () values would be promoted to the dtype of the field's numbers
             return {name: values[0] for name, values in self.at(points[None]).items()}
         distance = distances_of(type(self).__name__, self.shape, points)
@@ -185,12 +185,8 @@ class Hypertexture(EvaluationCounter, Producer):
         """Returns EMPTY where density is proven 0 for any noise, CONSTANT where it is proven 1 and
         there is no channel "distance", else DATA.
         """
-        layout = nodes.layout
-        half_extent = nodes.voxel_size * (0.5 * layout.brick_size + layout.border)
-        ends = self.shape.bounds(nodes.center, half_extent)
-        low, high = (
-            end[:, 0] for end in interval_of(self.shape, "value", ends, len(half_extent), 1)
-        )
+        ends = self.shape.bounds(nodes.center, nodes.half_extent(0))
+        low, high = (end[:, 0] for end in interval_of(self.shape, "value", ends, len(nodes), 1))
         margin = self._margins.to(low.device)[nodes.depth]
         kind = torch.full_like(nodes.depth, Region.DATA)
         if "distance" not in self.channels:

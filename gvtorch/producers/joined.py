@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..fields.field import modules_by_name
 from ..io.stores.channels import channel_names
 from ..io.stores.store import Store
 from .nodes import grid_of
@@ -74,7 +75,7 @@ class JoinedProducer(OfProducers):
                         f"that of the first {expected}"
                     )
         super().__init__(**grid_of(first), channels=channels, value_range=ranges, labels=labels)
-        self.producers = torch.nn.ModuleDict(producers)
+        self.producers = modules_by_name(context, producers)
         self.on_host = all(producer.on_host for producer in producers.values())
         self.on_device = all(producer.on_device for producer in producers.values())
         waits = [
@@ -121,7 +122,7 @@ class JoinedProducer(OfProducers):
         for name, producer in self.parts().items():
             answer = bricks[name] = producer.as_bricks(answers[name])
             (channel_name,) = producer.channels
-            data[name] = answer.data[channel_name]
+            data[name] = answer.voxels(channel_name)
             if channel_name in answer.constants:
                 constants[name] = answer.constants[channel_name]
         if all(answer.kind is None for answer in bricks.values()):

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..fields.noise import inherit
 from ..pool.pyramid import tree_depth
 
-_ROUNDING_VOXELS = 1 / 32  # voxels; tolerance for rounded positions
+ROUNDING_VOXELS = 1 / 32  # voxels by which boxes are widened, so that they hold rounded positions
 
 
 def grid_of(producer: Any) -> dict[str, Any]:
@@ -193,12 +193,17 @@ class Nodes:
         """
         return (self.voxel_size * (0.5 * (self.layout.side - 1))).norm(dim=1)
 
+    def half_extent(self, margin: float = ROUNDING_VOXELS) -> Tensor:
+        """Returns (k, 3) float64 half the world sides of the boxes that bricks cover, borders and
+        `margin` voxels around them included.
+        """
+        return self.voxel_size * (0.5 * self.layout.brick_size + self.layout.border + margin)
+
     def touch(self, boxes: Tensor) -> Tensor:
         """Returns (k,) bool: whether bricks, borders included, reach into any of (m, 2, 3) world
         boxes.
         """
-        layout, boxes = self.layout, boxes.to(self.loc.device, torch.float64)
-        half_extent = self.voxel_size * (0.5 * layout.brick_size + layout.border + _ROUNDING_VOXELS)
+        boxes, half_extent = boxes.to(self.loc.device, torch.float64), self.half_extent()
         low, high = (self.center - half_extent)[:, None], (self.center + half_extent)[:, None]
         return ((low <= boxes[:, 1]) & (high >= boxes[:, 0])).all(2).any(1)
 

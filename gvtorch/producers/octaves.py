@@ -56,6 +56,8 @@ class OctaveProducer(Producer):
         if not isinstance(total, (OctaveSum, SplineSum)):
             kind = type(total).__name__
             raise ValueError(f"{context}: total must be a SplineSum or an OctaveSum, got {kind}")
+        if values is not None and not callable(values):
+            raise ValueError(f"{context}: values must be a function, got {type(values).__name__}")
         if isinstance(total, SplineSum):
             check.branching_two(context, branching, "a SplineSum")
         self._names = ["value"]
@@ -114,6 +116,10 @@ class OctaveProducer(Producer):
         values, inherited = self.total.bricks(
             coordinates.unbind(1), side, parents, nodes.child, **brick_options
         )
-        if self.values is not None:
-            values = self.values(values, nodes)
-        return values, inherited
+        if self.values is None:
+            return values, inherited
+        result = self.values(values, nodes)
+        if not isinstance(result, Tensor) or result.shape != values.shape:
+            shape, got = tuple(values.shape), check.describe(result)
+            raise ValueError(f"{type(self).__name__}: values must return {shape}, got {got}")
+        return result, inherited

@@ -8,7 +8,6 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import itertools
-import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -22,7 +21,8 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.constants import MAX_BRANCHING, MAX_EXTENT
+from ..base.boxes import extent_of
+from ..base.constants import MAX_BRANCHING
 from ..base.volume import Volume, movable
 from ..pool import Channel
 from ..pool.pools import phrase
@@ -119,12 +119,27 @@ class Bricks(Answer):
     must not be changed afterwards.
     """
 
-    data: Voxels  # for each channel (k, z, y, x, c), border included
+    data: Voxels  # for each channel (k, z, y, x, c), border included; read where kind is DATA
     kind: Tensor | None = None  # (k,) of `Region`, -1: not finite; None: all DATA
     constants: Mapping[str, Tensor] = field(default_factory=dict)  # as in `Regions`
     alias: Tensor | None = None  # as in `Regions`
     alias_tree: str | None = None  # as in `Regions`
     errors: Mapping[int, str] = field(default_factory=dict, repr=False)  # as in `Regions`
+
+    def voxels(self, name: str) -> Tensor | TableRows:
+        """Returns a channel's voxels; those of EMPTY and CONSTANT items are filled with their
+        constants, or 0 without any, since `data` need not hold them.
+        """
+        values = self.data[name]
+        if self.kind is None:
+            return values
+        values = values.gather() if isinstance(values, TableRows) else values
+        kind = self.kind.to(values.device)
+        uniform = (kind == Region.EMPTY) | (kind == Region.CONSTANT)
+        shape = (len(uniform), *(1,) * 3, -1)[: values.dim()]
+        constant = self.constants.get(name, values.new_zeros(len(uniform))).to(values)
+        stored = torch.where(uniform.view(shape), movable(constant).view(shape), movable(values))
+        return stored.view(values.dtype)
 
 
 @runtime_checkable
@@ -220,11 +235,7 @@ class Producer(torch.nn.Module):
         """
         super().__init__()
         context = type(self).__name__
-        sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
-        if len(sizes) != 3:
-            raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-        x, y, z = (check.integer(context, "extent", size, low=1, high=MAX_EXTENT) for size in sizes)
-        self.extent = (x, y, z)
+        self.extent = extent_of(context, extent)
         if box is not None:
             low, high = check.box(context, box)
             spacing = [(b - a) / n for a, b, n in zip(low, high, self.extent, strict=True)]
@@ -233,9 +244,11 @@ class Producer(torch.nn.Module):
             spacing = (spacing,) * 3
         self.spacing, self.origin = check.grid_placement(context, spacing, origin, self.extent)
         self.branching = check.integer(context, "branching", branching, low=2, high=MAX_BRANCHING)
-        if channels is not None and not isinstance(channels, Mapping):
-            kind = type(channels).__name__
-            raise ValueError(f"{context}: channels must be Channel objects by name, got a {kind}")
+        arguments = {"channels": channels, "value_range": value_range, "labels": labels}
+        for argument, value in arguments.items():
+            if value is not None and not isinstance(value, Mapping):
+                kind = type(value).__name__
+                raise ValueError(f"{context}: {argument} must be a dict by channel, got a {kind}")
         self.channels = dict(channels) if channels is not None else {"value": Channel()}
         for name, channel in self.channels.items():
             if not isinstance(channel, Channel):
@@ -250,7 +263,8 @@ class Producer(torch.nn.Module):
                     f"{context}: {argument} has channel {unknown[0]!r}; there are {channel_names}"
                 )
         for name, bounds in self.value_range.items():
-            if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
+            low, high = check.reals(context, f"value_range[{name!r}]", bounds, (2,))
+            if low > high:
                 raise ValueError(
                     f"{context}: value_range[{name!r}] must be (smallest, largest), got {bounds!r}"
                 )
@@ -372,6 +386,9 @@ class Producer(torch.nn.Module):
             self.prepare(layout)
         else:
             layout = self.layout
+        if not points.numel():
+            widths = {n: c.width for n, c in self.channels.items() if not c.coarse}
+            return {n: points.new_zeros((*points.shape[:-1], c)).float() for n, c in widths.items()}
         position = (points.reshape(-1, 3).to(layout.origin_3) - layout.origin_3) / layout.spacing_3
         position = torch.minimum(position.clamp(min=0), layout.extent_3 - 1)  # in voxels
         depth = torch.full_like(position[:, :1], layout.depth)
@@ -398,8 +415,13 @@ class Producer(torch.nn.Module):
         answer = self.as_bricks(answer)
         for message in answer.errors.values():
             raise ValueError(f"{type(self).__name__}.at: {message}")
+        kind = answer.kind
+        if kind is not None and bool(((kind < Region.EMPTY) | (kind == Region.ALIAS)).any()):
+            raise ValueError(f"{type(self).__name__}.at: a brick is not finite, or an alias")
         shape = (len(loc), *(layout.side,) * 3, -1)
-        return {name: on_device(rows, loc.device).view(shape) for name, rows in answer.data.items()}
+        return {
+            name: on_device(answer.voxels(name), loc.device).view(shape) for name in answer.data
+        }
 
     def as_bricks(self, answer: Any) -> Any:
         """Wraps an answer of `fill` in `Bricks`; returns `Bricks` and invalid answers unchanged."""
@@ -466,10 +488,12 @@ class OfProducers(Producer):
             part.close()
 
 
-def check_points(context: str, points: Any) -> None:
-    """Raises ValueError unless points are (..., 3) and finite."""
-    if check.instance(context, "points", points, Tensor).shape[-1:] != (3,):
-        raise ValueError(f"{context}: points must be (..., 3), got {check.describe(points)}")
+def check_points(context: str, points: Any, *, floats: bool = False) -> None:
+    """Raises ValueError unless points are (..., 3) and finite, and floats if `floats` is true."""
+    check.instance(context, "points", points, Tensor)
+    if points.shape[-1:] != (3,) or (floats and not points.is_floating_point()):
+        wanted, got = "(..., 3) floats" if floats else "(..., 3)", check.describe(points)
+        raise ValueError(f"{context}: points must be {wanted}, got {got}")
     if not bool(torch.isfinite(points).all()):
         raise ValueError(f"{context}: points must be finite")
 

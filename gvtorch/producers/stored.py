@@ -321,8 +321,8 @@ class StoredProducer(Producer):
         for name, channel in self.channels.items():
             if channel.coarse and not nodes.coarse:
                 continue
-            dtype = np.dtype(str(channel.dtype).removeprefix("torch."))
-            out = np.zeros((len(loc), *(layout.side,) * 3, channel.width), dtype)
+            shape = (len(loc), *(layout.side,) * 3, channel.width)
+            out = torch.zeros(shape, dtype=channel.dtype).numpy()
             for level in np.unique(node_level).tolist():
                 rows = np.flatnonzero(node_level == level)
                 if level < store.levels:

@@ -28,9 +28,17 @@ from ..ops.shading import (
     channel_widths,
     pack,
 )
-from ..pool import Channel, N3Tree
+from ..pool import N3Tree
 from .lights import LightSettings, LitShader, a_number, a_triple
-from .shader import ColorTable, CutSurface, Sampling, Shader, number_of_one, one_color
+from .shader import (
+    ColorTable,
+    CutSurface,
+    Sampling,
+    Shader,
+    check_width,
+    number_of_one,
+    one_color,
+)
 from .transfer_function import TransferFunction, integrated_table
 
 __all__ = [
@@ -187,14 +195,9 @@ class StoredColor(LitShader):
         return blocker
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
-        one, by_direction = channel_widths(COLOR_WIDTH)
-        width = tree.bricks.channels.get(str(self.channel), Channel(width=one)).width
-        if width not in (one, by_direction):
-            raise ValueError(
-                f"{context}: stored colour needs {one} numbers a voxel, or {by_direction} for six "
-                f"directions, {self.channel!r} has {width}"
-            )
-        if width == by_direction and self.reference not in (None, min(tree.spacing)):
+        widths = channel_widths(COLOR_WIDTH)
+        width = check_width(f"{context}: stored colour needs", tree, self.channel, *widths)
+        if width != COLOR_WIDTH and self.reference not in (None, min(tree.spacing)):
             raise ValueError(
                 f"{context}: {self.channel!r} has six directions, so its opacity is that of the "
                 f"smallest spacing, {min(tree.spacing):g}; got reference {self.reference:g}"
@@ -274,12 +277,7 @@ class Isosurface(LitShader):
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         self._check_color()
         if self.color is None:
-            width = tree.bricks.channels.get(str(self.other), Channel(width=COLOR_WIDTH)).width
-            if width != COLOR_WIDTH:
-                raise ValueError(
-                    f"{context}: stored colour needs {COLOR_WIDTH} numbers a voxel, "
-                    f"{self.other!r} has {width}"
-                )
+            check_width(f"{context}: stored colour needs", tree, self.other, COLOR_WIDTH)
         return super().shading(context, tree)
 
     def table(self, sampling: Sampling) -> ColorTable:

@@ -144,7 +144,7 @@ class Channels(Shader):
         """
         self.looks = [
             ChannelLook(transfer=look) if isinstance(look, TransferFunction) else look
-            for look in looks
+            for look in check.items("Channels", "looks", looks)
         ]
         self.mode, self.channel = mode, channel
         self._tables: dict[Any, ColorTable] = {}
@@ -177,6 +177,7 @@ class Channels(Shader):
             raise ValueError(f"Channels.of: image must be a Volume or a Store, got {kind}")
         width = image.width
         chosen = range(width) if components is None else components
+        chosen = check.items("Channels.of", "components", chosen)
         if len(chosen) > MAX_CHANNELS:
             raise ValueError(
                 f"Channels.of: at most {MAX_CHANNELS} channels are shown together, "
@@ -263,7 +264,8 @@ def _make_table(
         table[:, header_row] = component, low, (len(rows) - 1) / (high - low), len(rows)
         table[:, row_slice, :3] = rows[:, :3]
         with np.errstate(divide="ignore"):
-            halvings = np.log1p(-rows[:, 3]) * (-function.length(sampling) / math.log(2))
+            (length,) = sampling.lengths(function.reference, 1)
+            halvings = np.log1p(-rows[:, 3]) * (-length / math.log(2))
         table[:, row_slice, 3] = (
             np.minimum(halvings, _OPAQUE_HALVINGS) * 2.0 ** np.arange(levels)[:, None]
         )

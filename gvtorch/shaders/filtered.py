@@ -51,7 +51,7 @@ from .coarse_colors import (
     without_light,
     write_colors,
 )
-from .shader import Sampling, Shader
+from .shader import Sampling, Shader, check_width
 from .transfer_function import TransferFunction
 
 #: Results of `finer`. The finest voxels are not filtered: the sharper their detail, the smaller
@@ -369,15 +369,10 @@ class Filtered(Shader):
                 "component, or it was edited: make them again (Filtered.of, Filtered.add_to, a new "
                 "producer)"
             )
-        one, by_direction = channel_widths(self.numbers)
-        width = tree.bricks.channels.get(str(self.other), Channel(width=one)).width
-        if width not in (one, by_direction):
-            raise ValueError(
-                f"{context}: filtered colours need {one} numbers a voxel, or {by_direction} for "
-                f"six directions, {self.other!r} has {width}"
-            )
+        widths = channel_widths(self.numbers)
+        check_width(f"{context}: filtered colours need", tree, self.other, *widths)
         arguments = super().shading(context, tree)
-        if arguments is None or one == COLOR_WIDTH:
+        if arguments is None or self.numbers == COLOR_WIDTH:
             return arguments
         return arguments._replace(shader=shader_number(self.lit_kind))
 

@@ -16,7 +16,7 @@ from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
 from .lights import LightSettings, LitShader
-from .shader import ColorTable, Sampling
+from .shader import ColorTable, Sampling, alpha_over
 
 BACKGROUND = 0
 _MAX_TABLE_ROWS = 2**24  # of a table, so that float32 can index its rows
@@ -161,11 +161,8 @@ class Labels(LitShader):
         levels = sampling.fitting(rows)
         table, opacity = np.zeros((levels, rows, 4)), appearance.opacities(labels)
         table[:, : len(labels), :3] = appearance.colors_of(labels)
-        length = sampling.step / (self.reference or sampling.smallest_spacing)
-        with np.errstate(divide="ignore"):
-            thickness = np.log1p(-opacity)
-        for level in range(levels):
-            table[level, : len(labels), 3] = -np.expm1(length * 2.0**level * thickness)
+        lengths = sampling.lengths(self.reference, levels)
+        table[:, : len(labels), 3] = alpha_over(lengths[:, None], opacity)
         visible = np.zeros(rows, bool)
         visible[: len(labels)] = opacity > 0
         return ColorTable.of(table, (first, first + rows - 1), visible, sampling)

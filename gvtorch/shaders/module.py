@@ -68,10 +68,10 @@ class ModuleShader(Shader, torch.nn.Module):
         range.
         """
         super().__init__()
-        if channels is not None and not len(channels):
-            raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
         self.module, self.hidden_by, self.samples = module, hidden_by, samples
         self.channels = () if channels is None else channels  # type: ignore[assignment]
+        if channels is not None and not self.channels:
+            raise ValueError(f"ModuleShader: channels must be names, got {channels!r}")
 
     def __repr__(self) -> str:
         name = getattr(self.module, "__name__", type(self.module).__name__)

@@ -97,6 +97,7 @@ CT_PRESETS: dict[str, FunctionPoints] = {
 IN_HU = {"bone": "ct-bone", "tissue": "ct-soft", "vessels": "ct-vessels"}
 
 COLORMAP_SAMPLES = 256  # of a colour map
+_POSITIONS = np.arange(COLORMAP_SAMPLES) / (COLORMAP_SAMPLES - 1)  # of these samples, 0 to 1
 
 
 def preset_points(name: str) -> FunctionPoints:
@@ -110,9 +111,7 @@ def preset_points(name: str) -> FunctionPoints:
     maps, hint = _colormaps()
     map_name = name.removeprefix("matplotlib:")
     if map_name in maps:
-        positions = np.arange(COLORMAP_SAMPLES) / (COLORMAP_SAMPLES - 1)
-        colors = linear_from_srgb(np.asarray(maps[map_name](positions))[:, :3])
-        return COLORMAP_OPACITY, np.column_stack((positions, colors)).tolist()
+        return _colormap(np.asarray(maps[map_name](_POSITIONS))[:, :3])
     raise ValueError(
         f"unknown preset {name!r}; known: {', '.join(sorted(presets))}, {hint}"
         f"{did_you_mean(map_name, (*presets, *maps))}"
@@ -121,10 +120,13 @@ def preset_points(name: str) -> FunctionPoints:
 
 def display_grays() -> FunctionPoints:
     """Returns grays over [0, 1] whose sRGB value is the data value."""
-    positions = np.arange(COLORMAP_SAMPLES) / (COLORMAP_SAMPLES - 1)
-    return COLORMAP_OPACITY, np.column_stack(
-        (positions, linear_from_srgb(np.repeat(positions[:, None], 3, 1)))
-    ).tolist()
+    return _colormap(np.repeat(_POSITIONS[:, None], 3, 1))
+
+
+def _colormap(colors: np.ndarray) -> FunctionPoints:
+    """Returns the points of a colour map, given its colours (k, 3) at `_POSITIONS`, as sRGB."""
+    points = np.column_stack((_POSITIONS, linear_from_srgb(colors)))
+    return COLORMAP_OPACITY, points.tolist()
 
 
 def _colormaps() -> tuple[Mapping[str, Callable[..., Any]], str]:

@@ -27,6 +27,7 @@ from ..ops.shading import (
 )
 from ..pool import N3Tree
 
+LARGEST = 1e300  # limit of values and lengths, so that their differences are finite
 _MAX_TABLE_BYTES = 64 * 2**20  # limit for a table in float32
 _CPU = torch.device("cpu")
 
@@ -46,6 +47,15 @@ class Sampling:
         many (at least 1) as keep the table within 64 MB in float32.
         """
         return max(1, min(self.levels, _MAX_TABLE_BYTES // (16 * rows)))
+
+    def lengths(self, reference: float | None, levels: int) -> np.ndarray:
+        """Returns (levels,) float64 lengths of intervals in units of a reference length, None: the
+        smallest spacing; at most 1e300, so that an infinite length of a transparent value is still
+        transparent.
+        """
+        shortest = min(self.step / (reference or self.smallest_spacing), LARGEST)
+        with np.errstate(over="ignore"):
+            return np.minimum(shortest * 2.0 ** np.arange(levels), LARGEST)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,11 +221,7 @@ class Shader(Checked):
                 tree.fine_channel(context, name)
         if self.kind is None:
             return None
-        if self.normals is not None and channels[self.normals].width != 3:
-            raise ValueError(
-                f"{context}: normals need 3 numbers a voxel, "
-                f"{self.normals!r} has {channels[self.normals].width}"
-            )
+        check_width(f"{context}: normals need", tree, self.normals, 3)
         if self.other is not None:
             last = channels[self.other].width - 1
             check.integer(
@@ -289,6 +295,12 @@ def one_color(color: Triple, sampling: Sampling) -> ColorTable:
     )
 
 
+def alpha_over(length: np.ndarray | float, opacity: np.ndarray) -> np.ndarray:
+    """Returns the alpha over lengths in reference lengths, given the opacity over one of these."""
+    with np.errstate(divide="ignore"):
+        return -np.expm1(length * np.log1p(-opacity))
+
+
 def row_and_fraction(position: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Returns for positions in a table of `count` rows (0: the first), clamped to it, the int64 row
     before each, at most the last but one, and the fraction, 0 to 1, of the way to the next row.
@@ -310,6 +322,20 @@ def check_shader(context: str, name: str, value: Any) -> None:
         raise ValueError(
             f"{context}: {name} must be a TransferFunction or another shader, got {kind}"
         )
+
+
+def check_width(
+    claim: str, tree: N3Tree, name: str | None, width: int, directional: int | None = None
+) -> int:
+    """Returns how many numbers a voxel has in a channel of a tree, `width` if there is no such
+    channel. Raises ValueError, which begins with `claim`, unless they are `width`, or as many as
+    hold six directions, `directional`.
+    """
+    channel = tree.bricks.channels.get(str(name))
+    if channel is None or channel.width in (width, directional):
+        return width if channel is None else channel.width
+    directions = "" if directional is None else f", or {directional} for six directions"
+    raise ValueError(f"{claim} {width} numbers a voxel{directions}, {name!r} has {channel.width}")
 
 
 def number_of_one(dtype: torch.dtype) -> float:

@@ -22,9 +22,8 @@ from ..base.messages import one_line
 from ..base.whole_file import write_text
 from .preset_files import paraview_item, read_preset
 from .presets import CT_PRESETS, Points, preset_points
-from .shader import ColorTable, Sampling, Shader
+from .shader import LARGEST, ColorTable, Sampling, Shader, alpha_over
 
-_LARGEST = 1e300  # limit of values and lengths, so that their differences are finite
 _CACHED_TABLES = 8  # cached tables of a function
 _FOREIGN_KEYS = {"RGBPoints", "volumeProperties"}  # keys of other programs' files
 # Cells of a table.
@@ -158,7 +157,8 @@ class TransferFunction(Shader):
         `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
         """
         context = "TransferFunction.stretched"
-        low, high = (check.number(context, n, v) for n, v in (("low", low), ("high", high)))
+        low = check.number(context, "low", low, low=-LARGEST, high=LARGEST)
+        high = check.number(context, "high", high, low=-LARGEST, high=LARGEST)
         if not high > low:
             high = low + max(1.0, 1e-6 * abs(low))
         first, last, _ = self.corners()
@@ -211,17 +211,6 @@ class TransferFunction(Shader):
             high = low + max(1.0, abs(low))
         return low, high, np.unique((values - low) / (high - low))  # rounding may make some equal
 
-    def length(self, sampling: Sampling) -> float:
-        """Returns the length of the shortest interval in reference lengths; at most 1e300, so that
-        an infinite length of a transparent value is still transparent.
-        """
-        return min(sampling.step / (self.reference or sampling.smallest_spacing), _LARGEST)
-
-    def lengths(self, sampling: Sampling, levels: int) -> np.ndarray:
-        """Returns (levels,) lengths of intervals in reference lengths; see `length`."""
-        with np.errstate(over="ignore"):
-            return np.minimum(self.length(sampling) * 2.0 ** np.arange(levels), _LARGEST)
-
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the function as the kernel reads it: rows at even distances over a domain. The
         last few tables are cached.
@@ -268,9 +257,7 @@ class TransferFunction(Shader):
     def _make_table(self, sampling: Sampling) -> ColorTable:
         low, high, rows = self.rows()
         levels = sampling.fitting(len(rows))
-        lengths = self.lengths(sampling, levels)
-        with np.errstate(divide="ignore"):
-            alpha = -np.expm1(lengths[:, None] * np.log1p(-rows[:, 3]))
+        alpha = alpha_over(sampling.lengths(self.reference, levels)[:, None], rows[:, 3])
         colors = np.broadcast_to(rows[:, :3], (levels, *rows[:, :3].shape))
         table = np.concatenate((colors, alpha[..., None]), 2)
         return ColorTable.of(table, (low, high), rows[:, 3] > 0, sampling)
@@ -299,7 +286,7 @@ def integrated_table(transfer: TransferFunction, sampling: Sampling) -> ColorTab
     weight = density / np.maximum(density.sum(1, keepdims=True), 1e-300)
     color = (weight[..., None] * samples[..., :3]).sum(1)
     rows = transfer(low + (high - low) * np.arange(cells + 1) / cells)
-    lengths = transfer.lengths(sampling, sampling.fitting(len(rows) ** 2))
+    lengths = sampling.lengths(transfer.reference, sampling.fitting(len(rows) ** 2))
     table = np.stack([_pairs(rows, thickness, color, length) for length in lengths])
     # A range that reaches into a cell is tested with both of the cell's rows, so it is enough to
     # mark one of them: not the first or last row, which also represent values beyond the domain.
@@ -314,8 +301,7 @@ def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: f
     count = len(rows)
     out = np.zeros((count, count, 4))
     diagonal = np.arange(count)
-    with np.errstate(divide="ignore"):
-        alpha = -np.expm1(length * np.log1p(-rows[:, 3]))
+    alpha = alpha_over(length, rows[:, 3])
     out[diagonal, diagonal] = np.concatenate((rows[:, :3] * alpha[:, None], alpha[:, None]), 1)
     for distance in range(1, count):
         # Transmittance of each cell in between.
@@ -377,9 +363,9 @@ def _checked_points(context: str, name: str, points: Points, width: int) -> np.n
             f"{context}: {name} must be a list of points {names}, got {check.quoted(points)}"
         )
     points = array.tolist()
-    if not (np.abs(array) <= _LARGEST).all():
+    if not (np.abs(array) <= LARGEST).all():
         raise ValueError(
-            f"{context}: {name} must be finite and at most {_LARGEST:g}, got {check.quoted(points)}"
+            f"{context}: {name} must be finite and at most {LARGEST:g}, got {check.quoted(points)}"
         )
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():

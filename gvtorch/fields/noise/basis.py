@@ -132,7 +132,7 @@ def as_points(context: str, points: Points) -> Tensor:
     Raises:
         ValueError: They have another shape or dtype.
     """
-    axes = (points,) if isinstance(points, Tensor) else tuple(points)
+    axes = (points,) if isinstance(points, Tensor) or not isinstance(points, Sequence) else points
     n = len(axes)
     if isinstance(points, Tensor):
         n = points.shape[-1] if points.dim() else 0
@@ -206,7 +206,7 @@ def bounds(basis: Basis, n: int = 3) -> Bounds:
     options: dict[str, Any] = {}
     while isinstance(basis, partial):
         options, basis = basis.keywords | options, basis.func
-    if basis is cellular:
+    if basis is cellular and n in (2, 3):
         slope = 2.0 if options.get("feature", "F1") == "F2-F1" else 1.0
         return Bounds(0.0, float(options.get("reach", 1)), slope)
     if (basis, n) not in _BOUNDS:

@@ -8,6 +8,7 @@ Source: Perlin, "An image synthesizer", SIGGRAPH 1985 (turbulence); Musgrave, in
 from __future__ import annotations
 
 import functools
+import math
 import operator
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple, TypedDict, Unpack
@@ -20,6 +21,8 @@ from .basis import Basis, Bounds, Period, Points, as_points, bounds, periods, pe
 
 #: Differences between the seeds of a sum's octaves, and between those of a warp's components.
 _NEXT_OCTAVE, _NEXT_AXIS = 0x10001, 0x3000007
+MOST_SEED = 2**62  # so that the seeds of all octaves fit into 64 bits
+_LARGEST_LOG = 700.0  # natural logarithm of the largest amplitude or frequency; float64 ends at 709
 
 
 class SumSettings(TypedDict, total=False):
@@ -67,13 +70,19 @@ def octaves_of(
     1, lacunarity, ...
 
     Raises:
-        ValueError: There are none, more than 64, or a number is not positive.
+        ValueError: There are none, more than 64, or a number is not positive, or grows too large.
     """
     check.number(context, "frequency", frequency, low=0, open_low=True)
     check.integer(context, "octaves", octaves, low=1, high=64)
     check.number(context, "lacunarity", lacunarity, low=0, open_low=True)
     check.number(context, "gain", gain, low=0, open_low=True)
-    check.integer(context, "seed", seed, low=-(2**62), high=2**62)
+    check.integer(context, "seed", seed, low=-MOST_SEED, high=MOST_SEED)
+    largest = math.log(max(frequency, 1)) + (octaves - 1) * math.log(max(lacunarity, gain))
+    if largest > _LARGEST_LOG:
+        raise ValueError(
+            f"{context}: {octaves} octaves of lacunarity {lacunarity:g} and gain {gain:g} exceed "
+            "the largest number"
+        )
     return [
         Octave(gain**index, lacunarity**index * frequency, seed + index * _NEXT_OCTAVE)
         for index in range(octaves)
@@ -158,7 +167,9 @@ def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettin
     """
     position = as_points("noise.warp", points)
     check.number("noise.warp", "amplitude", amplitude)
-    seed, shifts = settings.get("seed", 0), []
+    most = MOST_SEED - 3 * _NEXT_AXIS
+    seed = check.integer("noise.warp", "seed", settings.get("seed", 0), low=-MOST_SEED, high=most)
+    shifts = []
     for axis in range(position.shape[-1]):
         axis_settings: SumSettings = {
             "octaves": 1,
@@ -210,9 +221,10 @@ def _layers(
     if not callable(basis):
         raise ValueError(f"{context}: basis must be a function such as noise.perlin, got {basis!r}")
     axis_periods = periods(context, period, position.shape[-1])
+    series = octaves_of(context, octaves, lacunarity, gain, seed)
     if period is not None and lacunarity != int(lacunarity):
         raise ValueError(f"{context}: with a period lacunarity must be whole, got {lacunarity!r}")
-    for octave in octaves_of(context, octaves, lacunarity, gain, seed):
+    for octave in series:
         octave_period = None
         if period is not None:
             octave_period = [cells * int(octave.frequency) for cells in axis_periods]

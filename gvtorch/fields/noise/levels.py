@@ -22,6 +22,7 @@ Source: Lagrange's interpolation; the idea is from the original engine's example
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 
 import torch
@@ -106,7 +107,7 @@ class OctaveSum(EvaluationCounter):
         """
         context = "noise.OctaveSum"
         self.hold = check.number(context, "hold", hold, low=0, open_low=True)
-        if not settled >= self.hold:
+        if settled != math.inf and check.number(context, "settled", settled) < self.hold:
             raise ValueError(f"{context}: settled must be >= hold, {hold:g}, got {settled!r}")
         self.settled = settled
         self.octaves = octaves_of(context, octaves, lacunarity, gain, seed, frequency)
@@ -146,8 +147,8 @@ class OctaveSum(EvaluationCounter):
             settled = self._evaluate(axes, settled_octaves)
         else:
             settled = inherit(parents, child, border=border, branching=branching)
-            settled = settled + self._evaluate(axes, settled_octaves[len(inherited) :])
-        return settled + self._evaluate(axes, octaves[len(settled_octaves) :]), settled
+            settled = settled + self._evaluate(axes, _without(settled_octaves, inherited))
+        return settled + self._evaluate(axes, _without(octaves, settled_octaves)), settled
 
     def _octaves_wider(self, side: float, voxels: float) -> list[Octave]:
         """Returns the octaves whose cells are at least `voxels` voxels of a side wide."""
@@ -163,6 +164,10 @@ class OctaveSum(EvaluationCounter):
             total += octave.amplitude * perlin(positions * octave.frequency, seed=octave.seed)
             self._count(evaluations=total.numel())
         return total
+
+
+def _without(octaves: Sequence[Octave], others: Sequence[Octave]) -> list[Octave]:
+    return [octave for octave in octaves if octave not in others]
 
 
 @functools.cache

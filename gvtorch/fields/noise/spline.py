@@ -84,6 +84,7 @@ class SplineSum(EvaluationCounter):
         """
         context = "noise.SplineSum"
         check.branching_two(context, branching, "sums of splines")
+        check.number(context, "side", side, low=0, open_low=True)
         steps = math.log2(side * self.octaves[0].frequency)
         if abs(steps - round(steps)) > _TOLERANCE:
             raise ValueError(
