@@ -57,9 +57,8 @@ class RenderedScene:
         """Returns what a state shows from the given camera, without planes beside it: the picture
         (`picture`, if it is already rendered), or costs in its place or blended over it.
         """
-        # The picture is rendered first: costs of a store are those of the data that it loaded.
         developed = state.taken(self.render, camera) if picture is None else picture
-        return state.with_costs(lambda: developed, lambda: state.cost_picture(self.cost, camera))
+        return state.with_costs(developed, lambda: state.cost_picture(self.cost, camera))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -130,6 +130,8 @@ def encode(value: Any) -> Any:
         value = value.tolist() if is_small else _kept_marker(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
+    elif isinstance(value, (Mapping, list, tuple, range)) and len(value) > MAX_ITEMS:
+        value = _kept_marker(value)
     elif isinstance(value, Mapping):
         value = {str(name): encode(item) for name, item in value.items()}
     elif isinstance(value, (list, tuple, range)):
@@ -305,9 +307,10 @@ def _decode_mapping(path: str, hint: Any, content: Any, depth: int) -> Any:
     decoded = {}
     for name, item in content.items():
         try:
-            decoded[key_type(name)] = decode(f"{path}.{name}", value_hint, item, None, depth + 1)
-        except (TypeError, ValueError) as error:
+            key = key_type(name)
+        except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+        decoded[key] = decode(f"{path}.{name}", value_hint, item, None, depth + 1)
     return decoded
 
 
