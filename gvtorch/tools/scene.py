@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, ReadOptions, given_flags, option, refuse_file_flags
+from .common import Bar, ReadOptions, given_flags, option, refuse_file_flags, refuse_store_flags
 from .look import Look
 from .streaming import Streaming, print_failures
 
@@ -83,11 +83,7 @@ class SceneFlags:
             with self._stream(path, options) as scene:
                 yield scene
             return
-        flags = given_flags(self.streaming)
-        if flags:
-            raise ValueError(
-                f"{flags[0]} is for stores; make one: gvtorch convert {path} STORE.zarr"
-            )
+        refuse_store_flags(path, given_flags(self.streaming))
         yield self._resident(path, options, bar)
 
     def _resident(self, path: str, options: dict[str, Any], bar: Bar) -> RenderedScene:

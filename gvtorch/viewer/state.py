@@ -218,9 +218,9 @@ class ViewState:
             object.__setattr__(self, "options", options)
 
     @property
-    def composed(self) -> bool:
-        """Whether planes stand beside the picture, or costs lie over it."""
-        return self.slices is not None or (self.show != "picture" and self.blend < 1)
+    def is_plain(self) -> bool:
+        """Whether it shows the picture alone, without planes beside it and without costs."""
+        return self.slices is None and self.show == "picture"
 
     def settings(self) -> dict[str, Any]:
         """Returns the fields of `RenderOptions` as keyword arguments."""
