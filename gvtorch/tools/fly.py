@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..viewer.flight import Flight, KeyFile
     from ..viewer.state import ViewState
 
-_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILM_SUFFIXES"))
+_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILM_SIDES"))
 
 
 @dataclass(frozen=True, kw_only=True)
