@@ -214,7 +214,7 @@ def test_every_shader_and_section_has_controls_that_work(tab, viewer):
     tab.until(lambda: viewer.state.shader.diffuse == 0.33)
     tab.page.locator("label.gv-row:has-text('shadows') input").check()
     tab.until(lambda: viewer.state.shader.shadows is True)
-    tab.page.locator("label.gv-row:has-text('lens') select").select_option("ThinLens")
+    tab.page.locator("label.gv-row:has-text('lens') select").select_option("Thin lens")
     tab.until(lambda: viewer.state.options.lens is not None)
     tab.page.locator("label.gv-row:has-text('lighting') select").select_option("Lighting")
     tab.until(lambda: viewer.state.options.lighting is not None)

@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..base.messages import one_line
+from ..base.units import unit_symbol
 from ..base.volume import Volume
 from ..cameras.models import MODELS
 from ..engine import EngineOptions
@@ -44,9 +45,8 @@ _ENGINE_OPTIONS = (
     "time_budget",
     "loading",
 )
-_COLOR_MAPS = (
-    *("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "coolwarm", "bone", "hot"),
-)
+#: Of matplotlib: a page offers them beside the presets, and keeps its opacity when one is chosen.
+_COLOR_MAPS = ("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "coolwarm")
 
 
 class Session:
@@ -293,7 +293,7 @@ class Session:
             client=client.number,
             name=self.scene.name,
             box=box,
-            unit=info.unit,
+            unit=unit_symbol(info.unit),
             time=self.scene.describe_time(),
             labels=self.scene.describe_labels(),
             channels=[channel.name for channel in info.channels],
@@ -459,8 +459,11 @@ class Session:
         client.send_message("histogram", in_view=message.in_view, **histogram)
 
     def _take_preset(self, client: Client, message: protocol.Preset) -> None:
-        function = TransferFunction.preset(message.name, message.low, message.high)
-        client.send_message("preset", name=message.name, function=encode(function))
+        name = message.name
+        limits = (None, None) if name in CT_PRESETS else (message.low, message.high)
+        function = TransferFunction.preset(name, *limits)
+        colors_only = name in _COLOR_MAPS
+        client.send_message("preset", name=name, function=encode(function), colors_only=colors_only)
 
     def _take_read(self, client: Client, message: protocol.Read) -> None:
         arguments = message.file, message.text, message.name, message.low, message.high
