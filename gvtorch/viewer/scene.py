@@ -20,12 +20,12 @@ from ..base.image_info import ImageInfo
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable, to_numpy
 from ..cameras import Camera
-from ..engine import Engine, EngineOptions, FrameStats
+from ..engine import Engine, FrameStats
 from ..io.reading import open_source, read_volume
 from ..io.stores.ngff import is_zarr
 from ..io.stores.store import Store
 from ..io.window import sample_values, window
-from ..ops import unavailable
+from ..ops.registry import device_of
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..producers import Producer, StoredProducer, VolumeProducer
@@ -303,8 +303,7 @@ def open_scene(what: Any, **options: Any) -> Scene:
             raise ValueError(f"view: {next(iter(options))} is set where the scene is made already")
         return Scene(repr(what), *((what, None) if isinstance(what, Engine) else (None, what)))
     options.setdefault("time_budget", _BUDGET_MS)
-    if "device" not in options and not unavailable()["cuda"]:
-        options["device"] = "cuda"
+    options.setdefault("device", device_of("auto"))
     if isinstance(what, Mapping) and all(
         isinstance(producer, Producer) for producer in what.values()
     ):
@@ -312,7 +311,7 @@ def open_scene(what: Any, **options: Any) -> Scene:
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
     data, series = _open_data(what), series_of(what)
-    options.setdefault("border", 2 if data.info.labels else EngineOptions.border)
+    options.setdefault("border", data.info.default_border)
     engine = Engine(_producer_of(data), **options)
     return Scene(data.name, engine, data=data, remake=_producer_of, **series)
 

@@ -40,7 +40,7 @@ from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 
 MAX_ITEMS = 4096  # of a list
 _MAX_NUMBERS = 4 * MAX_ITEMS  # of an array: a row of a transfer function has four
-MAX_DEPTH = 16  # of objects in objects
+_MAX_DEPTH = 16  # of objects in objects
 
 #: Classes that JSON may name, by name.
 KINDS: dict[str, type] = {
@@ -179,8 +179,8 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
     Raises:
         ValueError: The content is not of the type, or the object refuses it.
     """
-    if depth > MAX_DEPTH:
-        raise ValueError(f"{path}: objects in objects in objects, more than {MAX_DEPTH}")
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"{path}: objects in objects in objects, more than {_MAX_DEPTH}")
     if isinstance(content, dict) and set(content) == {"kept"}:
         if current is not None:
             return current

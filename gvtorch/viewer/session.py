@@ -64,7 +64,6 @@ class Session:
         """Takes a scene, which only the session's thread uses from now on."""
         self.scene, self.state, self.parameters = scene, state, parameters
         self.clients: dict[int, Client] = {}
-        self.errors = 0  # pictures that failed
         self._last_good_state = state  # the last state that was drawn
         self._client_count, self._last_drawn_client = 0, 0
         self._tasks: deque[Callable[[], None]] = deque()
@@ -225,7 +224,6 @@ class Session:
 
     def _report_failure(self, client: Client, error: Exception) -> None:
         """Reports why a picture failed, and returns to the last state that was drawn."""
-        self.errors += 1
         self._broadcast("error", text=one_line(error))
         if self._last_good_state is not self.state:
             self.state = self._last_good_state
