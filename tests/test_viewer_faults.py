@@ -62,6 +62,13 @@ def test_an_eye_too_near_its_target_is_refused_before_it_is_drawn():
         Eye(eye=(0, 0, 1e-200), target=(0, 0, 0))
 
 
+def test_an_eye_has_the_fields_of_view_that_cameras_have():
+    for fov in (0, 1e-13, 180, float("nan")):
+        with pytest.raises(ValueError, match="Eye: fov must be finite and >= 1e-12 and <= 179"):
+            Eye(eye=(0, 0, 1), target=(0, 0, 0), fov=fov)
+    assert Eye(eye=(0, 0, 1), target=(0, 0, 0), fov=1e-12).camera(8, 8, torch.eye(3)[:2])
+
+
 def test_a_scene_that_can_not_be_made_again_stays_as_it_was():
     """Of the new time point no producer can be made."""
     first, second = bright_ball(), bright_ball()

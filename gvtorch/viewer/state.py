@@ -57,8 +57,7 @@ class Eye:
     def __post_init__(self) -> None:
         for name in ("eye", "target", "up"):
             object.__setattr__(self, name, check.triple("Eye", name, getattr(self, name)))
-        widest = model_of("Eye", self.model).widest
-        check.number("Eye", "fov", self.fov, low=0, high=widest, open_low=True)
+        model_of("Eye", self.model).checked_fov("Eye", self.fov)
         if max(abs(number) for number in (*self.eye, *self.target, *self.up)) > _MAX_COORDINATE:
             raise ValueError(f"Eye: eye, target and up must be at most {_MAX_COORDINATE:g}")
         if math.dist(self.eye, self.target) < _MIN_DISTANCE or not any(self.up):
