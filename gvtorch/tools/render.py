@@ -101,7 +101,7 @@ class Render:
                 state = state.read(self.state)
                 name = f"{self.state}: component"
                 scene.info.check_component(name, state.component, scene.data.width)
-            stats = self._write_picture(scene, state, bar)
+            stats = self._write_picture(scene, state, (width, height), bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": scene.data.extent}
             write_text(self.stats, json.dumps(content, indent=2) + "\n")
@@ -146,25 +146,25 @@ class Render:
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
-    def _camera(self, scene: RenderedScene, state: ViewState) -> Camera:
+    def _camera(self, scene: RenderedScene, state: ViewState, size: tuple[int, int]) -> Camera:
         """Returns the camera of the state, or else that of --camera."""
         from ..viewer.slices import panes
 
-        width, height = parse_size(self.size)
-        if state.slices is not None:
-            _, _, width, height = panes(width, height)["view"]
+        width, height = size if state.slices is None else panes(*size)["view"][2:]
         if state.camera is None:
             return parse_camera(self.camera, self.scene.look, width, height, scene.info.space)
         return state.camera.camera(width, height, scene.box)
 
-    def _write_picture(self, scene: RenderedScene, state: ViewState, bar: Bar) -> RenderStats:
+    def _write_picture(
+        self, scene: RenderedScene, state: ViewState, size: tuple[int, int], bar: Bar
+    ) -> RenderStats:
         """Renders and writes what the state shows, strip by strip where the file format allows
         it; a saved state may add slices beside the picture and costs over it.
         """
         from ..pictures import render_tiles
         from ..viewer.state import Eye
 
-        camera = self._camera(scene, state)
+        camera = self._camera(scene, state, size)
         needs_whole = self.npz is not None or not state.is_plain
         strips = not needs_whole and in_strips(self.output.suffix, camera.width, camera.height)
         render = scene.render if strips else partial(scene.render, progress=bar)
@@ -189,7 +189,6 @@ class Render:
             if state.slices is not None:
                 from ..viewer.slices import Planes
 
-                size = parse_size(self.size)
                 with closing(Planes(scene.data, lambda problem: None)) as planes:
                     canvas = planes.composed(canvas, state, *size, wait=True).picture
             canvas = canvas if overlay is None else overlay.over(canvas)

@@ -80,14 +80,16 @@ class View:
         """Returns the scene, its shader, its camera, and fields of `RenderOptions`."""
         if self.path.endswith(".py"):
             return self._run_script()
+        from ..viewer.view import ASPECT
+
         look = self.scene.look
-        parse_camera(self.camera, look, 16, 9)
+        parse_camera(self.camera, look, *ASPECT)  # raises before the data are read
         options = look.options()
         source = replace(self.scene.source, time=self.scene.source.time or 0)
         with Bar() as bar:
             bar("reading", 0, 0)
             scene, shader = self._make_scene(replace(self.scene, source=source))
-        return scene, shader, parse_camera(self.camera, look, 16, 9, scene.info.space), options
+        return scene, shader, parse_camera(self.camera, look, *ASPECT, scene.info.space), options
 
     def _make_scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
         """Returns the scene of a page, at a time point, and its shader."""

@@ -25,7 +25,7 @@ from .server import Server, aiohttp_web
 from .session import Session
 from .state import Eye, ViewState
 
-_ASPECT = (16, 9)  # shape of the picture to which the first camera fits the box
+ASPECT = (16, 9)  # shape of the picture to which the first camera fits the box
 
 
 class Viewer:
@@ -171,7 +171,7 @@ def new_session(
             chosen = state if isinstance(state, ViewState) else chosen.read(Path(state))
         if chosen.camera is None:
             if camera is None:
-                eye = Eye.first(scene.box, *_ASPECT, up or "+y")
+                eye = Eye.first(scene.box, *ASPECT, up or "+y")
             else:
                 eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)
