@@ -250,6 +250,20 @@ def test_a_still_that_can_not_be_written_is_told_and_the_view_goes_on(session, m
     page.moved(turned_camera(page.camera, 0.3))
 
 
+def test_figures_that_can_not_be_made_are_told_and_the_view_goes_on(session, monkeypatch):
+    page = Page(session)
+    page.final()
+    monkeypatch.setattr(
+        session, "_frame_figures", lambda picture: {}["no such figure"], raising=True
+    )
+    session.ask(lambda: setattr(page.client, "monitor", True))
+    session._figures_time = 0.0
+    page.send("move", camera=turned_camera(page.camera, 0.3), moving=False)
+    assert "no such figure" in page.next("error", 0)["text"]
+    session.ask(lambda: setattr(page.client, "monitor", False))
+    page.moved(turned_camera(page.camera, 0.6))
+
+
 def test_a_widget_that_can_not_be_made_closes_its_view(monkeypatch):
     from gvtorch.viewer import notebook
 

@@ -206,18 +206,17 @@ class Session:
         self._last_drawn_client = client.number
         try:
             picture = client.draw(self.scene, self.state, self._is_outdated, self._planes)
-        except Exception as error:
+            if picture is None:
+                return
+            self._last_good_state = self.state
+            self._send_nodes(client)
+            self._broadcast_busy(picture)
+            self._broadcast_failures()
+            if client.monitor and time.monotonic() - self._figures_time > _FIGURES_SECONDS:
+                self._figures_time = time.monotonic()
+                client.send_message("figures", **self._frame_figures(picture))
+        except Exception as error:  # whatever it was, the view goes on
             self._report_failure(client, error)
-            return
-        if picture is None:
-            return
-        self._last_good_state = self.state
-        self._send_nodes(client)
-        self._broadcast_busy(picture)
-        self._broadcast_failures()
-        if client.monitor and time.monotonic() - self._figures_time > _FIGURES_SECONDS:
-            self._figures_time = time.monotonic()
-            client.send_message("figures", **self._frame_figures(picture))
 
     def _is_outdated(self) -> bool:
         return bool(self._tasks) or self._closed
