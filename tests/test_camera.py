@@ -377,7 +377,7 @@ def test_small_cameras_share_calls(monkeypatch):
         (lambda: gv.Camera.orbit(up=(0, 1)), "up must be three numbers"),
         (lambda: gv.Camera.fit([[0, 0, 0], [1, 0, 1]]), "must have its low corner below"),
         (lambda: gv.CameraPath.orbit(BOX, distance=2, fit_size=(8, 8)), "fit_size finds"),
-        (lambda: gv.Camera.orbit(fov=0), "fov must be finite and > 0 and <= 179"),
+        (lambda: gv.Camera.orbit(fov=0), "fov must be finite and >= 1e-12 and <= 179"),
         (lambda: gv.Camera.orbit(fov=math.nan), "fov must be finite"),
         (lambda: gv.Camera.orbit(width=0), "width must be an int >= 1"),
         (lambda: gv.Camera.orbit(height=2.5), "height must be an int"),

@@ -237,6 +237,17 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
         assert run.returncode == 2 and message in run.stderr and not (tmp_path / "g").exists()
 
 
+@pytest.mark.parametrize("scale", ["nan", "inf", "-1", "0"])
+def test_a_wrong_scale_is_told_with_its_file(tmp_path, scale):
+    file = tmp_path / "c.pvcc"
+    gv.write_cameras(file, gv.Camera.look_at(EYE, TARGET, width=8, height=8, model="ortho"))
+    head, tail = file.read_text().split('name="CameraParallelScale"')
+    rest = tail.partition('value="')[2].partition('"')[2]
+    file.write_text(f'{head}name="CameraParallelScale"><Element index="0" value="{scale}"{rest}')
+    with pytest.raises(ValueError, match=r"c\.pvcc: "):
+        gv.read_cameras(file, width=8, height=8)
+
+
 @pytest.mark.parametrize("name", ["c.pvcc", "t.json", "model/cameras.txt", "model/images.txt"])
 def test_damaged_bytes_give_cameras_or_one_line(tmp_path, name):
     gv.write_cameras(tmp_path / "c.pvcc", gv.Camera.look_at(EYE, TARGET, UP, 40, 64, 48))

@@ -250,7 +250,7 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--backend", "cuda"], "backend 'cuda' can't be used here"),
         (lambda t, s: [npy(t, np.zeros((0, 4, 4)))], "at least 1 in every direction"),
         (lambda t, s: [npy(t, np.full((4, 4, 4), np.nan))], "NaN or infinite"),
-        (lambda t, s: [s, "--npz", "a.txt"], "--npz must end in .npz"),
+        (lambda t, s: [s, "--npz", "a.txt"], "--npz: path must end in .npz"),
         (lambda t, s: [s, "--heat", "1"], "gvtorch: error: Unrecognized options: --heat"),
         (lambda t, s: [s, "--npz", "no/such/folder/a.npz"], "folder not found: no/such/folder"),
     ],

@@ -91,7 +91,11 @@ def test_files_of_every_kind(small, tmp_path, name, bits):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["-o", "a.jpg"], "--output must end in .png, .exr, .npy, .npz, .tif, got 'a.jpg'"),
+        (["-o", "a.jpg"], "--output: path must end in .png, .tif, .exr, .npy or .npz, got 'a.jpg'"),
+        (["-o", "a.png", "--npz", "a.png"], "--npz: path must end in .npz, got 'a.png'"),
+        (["-o", "no/a.png"], "--output: folder not found: no"),
+        (["-o", "a.png", "--npz", "no/a.npz"], "--npz: folder not found: no"),
+        (["-o", "a.png", "--stats", "no/a.json"], "--stats: folder not found: no"),
         (["-o", "a.png", "--bits", "7"], ".png has 8 or 16 bits, got 7"),
         (["-o", "a.tif", "--npz", "a.npz"], "--npz holds a whole picture: not with .tif"),
         (["-o", "a.png", "--samples", "0"], "--samples must be an int >= 1, got 0"),
@@ -116,6 +120,8 @@ def others(small, tmp_path):
     ViewState(shader=gv.TransferFunction.preset("hot", 0, 200)).save(tmp_path / "t.json")
     (tmp_path / "fourth.json").write_text('{"component": 3}')
     (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "costs.json").write_text('{"show": "samples"}')
+    (tmp_path / "time.json").write_text('{"time": 0}')
     (tmp_path / "sky.exr").touch()
     (tmp_path / "stack").mkdir()
     for number in range(3):
@@ -160,6 +166,16 @@ def others(small, tmp_path):
         ("render v.npy -o a.png --camera file:c.pvcc --camera-model fisheye", "--camera-model"),
         ("render v.npy -o a.png --clip=", "--clip must hold plane:"),
         ("render v.npy -o a.png --camera=", "--camera must be orbit:"),
+        ("render v.npy -o a.png --state costs.json --bar", "--bar is for a picture alone"),
+        ("fly v.npy -o a.gif --state costs.json --frames 2 --bar", "--bar is for a picture alone"),
+        ("fly v.npy -o f --turntable 1e300", "--turntable must be finite and > 0 and <= 8.58"),
+        ("fly v.npy -o f --poses no/c.json", "--poses: folder not found: no"),
+        ("fly v.npy -o f --stats no/c.json", "--stats: folder not found: no"),
+        ("view v.npy --no-browser --state time.json --time 1", "--state sets what --time sets"),
+        ("view v.npy --no-browser --mode balanced", "--mode is for single pictures"),
+        ("view v.npy --no-browser --max-frames 5", "--max-frames is for single pictures"),
+        ("view v.npy --no-browser --image x", "--image is for stores; make one: gvtorch convert"),
+        ("view v.npy --no-browser --host-cache 1MB", "--host-cache is for stores; make one"),
         ("convert v.npy stack --dry-run", "exists and is not a store"),
         ("convert v.npy a.zarr --dry-run --spacing 0,2,2", "spacing"),
         ("convert v.npy a.zarr --dry-run --memory much", "--memory"),
@@ -219,7 +235,7 @@ def test_a_saved_component_is_that_of_the_bar_and_of_warnings(tmp_path, monkeypa
     monkeypatch.setattr(
         Annotations,
         "overlay",
-        lambda self, *args: seen.append(args[2]) or overlay(self, *args),
+        lambda self, *args: seen.append(args[0].component) or overlay(self, *args),
     )
     common = ("--state", "s.json", "--size", "96x64", "-o", "a.png")
     done = gvtorch("render", "v.zarr", *common, "--bar", cwd=tmp_path)

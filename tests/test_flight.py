@@ -274,6 +274,7 @@ def test_a_saved_view_is_turned(small, tmp_path):
         (tmp_path / "bad.json").write_text(content)
         run = gvtorch("fly", small, "-o", tmp_path / "no", "--state", tmp_path / "bad.json")
         assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
+        assert run.stderr.count("bad.json") == 1, run.stderr
     assert not (tmp_path / "no").exists()
 
 

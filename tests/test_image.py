@@ -254,7 +254,7 @@ def test_a_batch_is_laid_side_by_side(tmp_path, tree):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda p, t: p.save(t / "a.jpg"), "must end in .png, .npz, .npy, .exr or .tif, got"),
+        (lambda p, t: p.save(t / "a.jpg"), "must end in .png, .tif, .exr, .npy or .npz, got"),
         (lambda p, t: p.save(t / "a.png", bits=12), ".png has 8 or 16 bits, got 12"),
         (lambda p, t: p.save(t / "no" / "a.png"), "folder not found"),
         (lambda p, t: p.tone_map("film"), "curve must be 'none', 'reinhard' or 'aces', got 'film'"),

@@ -379,10 +379,10 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
     [
         (lambda: gv.Camera.orbit(model="wide"), "model must be 'pinhole', 'ortho', 'fisheye'"),
         (lambda: gv.Camera(torch.eye(4), torch.eye(3), 4, 4, model="sphere"), "model must be"),
-        (lambda: gv.Camera.orbit(fov=180), "fov must be finite and > 0 and <= 179"),
+        (lambda: gv.Camera.orbit(fov=180), "fov must be finite and >= 1e-12 and <= 179"),
         (
             lambda: gv.Camera.orbit(fov=361, model="fisheye"),
-            "fov must be finite and > 0 and <= 360",
+            "fov must be finite and >= 1e-12 and <= 360",
         ),
         (lambda: gv.Camera.orbit(fov=181, model="panorama"), "and <= 180"),
         (lambda: askew("pinhole", radial_coeffs=BEND), "radial_coeffs are for a fisheye"),

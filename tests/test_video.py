@@ -84,11 +84,40 @@ def test_a_mistake_leaves_nothing(tmp_path, name):
         (lambda t: gv.Video(t / "a.gif", 8, 8, fps=51), "fps must be an int >= 1 and <= 50"),
         (lambda t: gv.Video(t / "a.webp", 8, 8, fps=0), "fps must be an int >= 1 and <= 1000"),
         (lambda t: gv.Video(t / "x" / "a.gif", 8, 8), "folder not found"),
+        (lambda t: gv.Video(t / "a.mp4", 0, 8), "width must be an int >= 1 and <= 16384, got 0"),
+        (lambda t: gv.Video(t / "a.gif", 8, -2), "height must be an int >= 1"),
+        (lambda t: gv.Video(t / "a.webp", 8, 16384), "height must be an int >= 1 and <= 16383"),
+        (lambda t: gv.Video(t / "a.gif", "8", 8), "width must be an int"),
     ],
 )
 def test_bad_films_are_named(tmp_path, make, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         make(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_pictures_are_added_within_the_block_only(tmp_path, name):
+    video = gv.Video(tmp_path / name, WIDTH, HEIGHT)
+    with pytest.raises(RuntimeError, match="within its with block"):
+        video.add(picture(0))
+    with video:
+        video.add(picture(0))
+    with pytest.raises(RuntimeError, match="within its with block"):
+        video.add(picture(0))
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_a_film_that_can_not_be_opened_leaves_nothing(tmp_path, monkeypatch, name):
+    video = gv.Video(tmp_path / name, WIDTH, HEIGHT)
+
+    def fail(part):
+        part.touch()
+        raise OSError("no encoder")
+
+    monkeypatch.setattr(video._film, "open", fail)
+    with pytest.raises(OSError, match="no encoder"), video:
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_pictures_of_another_size_are_refused(tmp_path):

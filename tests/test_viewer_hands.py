@@ -353,6 +353,26 @@ def test_every_edit_is_undone_and_done_again(tab, viewer, tmp_path):
     tab.final()
 
 
+def test_a_file_that_is_no_state_leaves_the_view_as_it_is(tab, viewer, tmp_path):
+    before, camera = viewer.session.ask(viewer.state.to_json), tab.app("app.camera")
+    note = tab.page.locator(".gv-note")
+    for content in ({"camera": {"eye": 5}}, {"camera": 7}, {"shader": None}, [1], 5):
+        (tmp_path / "view.json").write_text(json.dumps(content))
+        tab.app("(app.notify('nothing'), null)")
+        with tab.page.expect_file_chooser() as chooser:
+            tab.page.get_by_label("Load what was saved").click()
+        chooser.value.set_files(tmp_path / "view.json")
+        tab.until(lambda: "nothing" not in note.inner_text())
+        tab.until("document.querySelector('.gv-note').classList.contains('gv-bad')")
+    tab.page.wait_for_timeout(300)
+    assert tab.app("app.camera") == camera
+    assert viewer.session.ask(viewer.state.to_json) == before
+    assert tab.app("app.state.shader.kind") == "TransferFunction"
+    tab.drag((300, 300), (420, 330))
+    tab.until(f"JSON.stringify(app.camera) !== {json.dumps(json.dumps(camera))}")
+    tab.final()
+
+
 def test_views_become_the_keys_of_a_film(tab, viewer, tmp_path):
     """`gvtorch fly --keys` reads them; keys are shown, moved, removed, undone and loaded."""
     tab.open("Film")

@@ -25,12 +25,14 @@ STAGE = (340.0, 210.0)  # the middle of the picture, in the page
 #: As anywidget does, passes a model and an element to the module.
 _MODEL = """async (text) => {
   const url = URL.createObjectURL(new Blob([text], { type: "text/javascript" }));
-  const takers = [];
+  const takers = new Set();
   const view = (raw) => new DataView(Uint8Array.from(atob(raw), (c) => c.charCodeAt(0)).buffer);
   window.give = (text, raw) => takers.forEach((take) => take({ text }, raw ? [view(raw)] : []));
   const send = (content) => window.toPython(content);
-  const model = { get: () => 400, on: (_, take) => takers.push(take), send };
-  await (await import(url)).default.render({ model, el: document.getElementById("cell") });
+  const on = (_, take) => takers.add(take), off = (_, take) => takers.delete(take);
+  const model = { get: () => 400, on, off, send }, el = document.getElementById("cell");
+  const end = await (await import(url)).default.render({ model, el });
+  window.leave = () => { end(); return takers.size; };
 }"""
 
 
@@ -214,7 +216,7 @@ def test_every_shader_and_section_has_controls_that_work(tab, viewer):
     tab.until(lambda: viewer.state.shader.diffuse == 0.33)
     tab.page.locator("label.gv-row:has-text('shadows') input").check()
     tab.until(lambda: viewer.state.shader.shadows is True)
-    tab.page.locator("label.gv-row:has-text('lens') select").select_option("ThinLens")
+    tab.page.locator("label.gv-row:has-text('lens') select").select_option("Thin lens")
     tab.until(lambda: viewer.state.options.lens is not None)
     tab.page.locator("label.gv-row:has-text('lighting') select").select_option("Lighting")
     tab.until(lambda: viewer.state.options.lighting is not None)
@@ -298,8 +300,10 @@ def test_the_notebook_mounts_the_same_page(chromium):
     page.on("pageerror", lambda error: complaints.append(str(error)))
 
     def take(_source, content):
-        if "joined" in content:
+        if content.get("joined"):
             clients.append(session.join(waiting.append))
+        elif "joined" in content:
+            session.leave(clients[0])
         else:
             session.receive(clients[0], content["text"])
 
@@ -323,6 +327,8 @@ def test_the_notebook_mounts_the_same_page(chromium):
         assert page.evaluate("() => document.querySelector('.gv').app.view.head.final")
         box = page.locator(".gv").bounding_box()
         assert box["height"] == 400 and not complaints
+        assert page.evaluate("() => leave()") == 0, "the page that has left listens no more"
+        assert session.ask(lambda: len(session.clients)) == 0
     finally:
         context.close()
         session.close()

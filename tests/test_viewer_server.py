@@ -266,6 +266,9 @@ def test_the_widget_joins_leaves_and_has_a_png(session):
         if any(buffers for _, buffers in sent):
             break
     assert json.loads(sent[0][0]["text"])["type"] == "welcome"
+    opened._receive(opened, {"joined": True}, [])  # the view is shown below a second cell
+    opened._receive(opened, {"joined": False}, [])
+    assert session.ask(lambda: len(session.clients)) == 1, "the other cell still shows it"
     opened._receive(opened, {"joined": False}, [])
     assert session.ask(lambda: len(session.clients)) == 0
     bundles = opened._repr_mimebundle_()

@@ -86,6 +86,11 @@ class ImageInfo:
     def __post_init__(self) -> None:
         object.__setattr__(self, "channels", tuple(self.channels))
 
+    @property
+    def default_border(self) -> int:
+        """Voxels of overlap around a brick: 1, or 2 for labels, to smooth their slanted faces."""
+        return 2 if self.labels else 1
+
     def check_component(self, name: str, component: int, width: int) -> None:
         """Raises ValueError, which lists the components, unless the `width` numbers of a voxel
         have this one; `name` is what chose it.

@@ -36,7 +36,6 @@ from .poses import (
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MIN_FOV_DEGREES = 1e-12
 _FIT_FRACTION = 0.98  # share of half the picture's width or height that a fitted box takes
 
 
@@ -481,12 +480,7 @@ def _aimed(
 ) -> Camera:
     """Returns cameras with a centred axis; `distance` (...) is that of the target."""
     camera_model = model_of(context, model)
-    fov = camera_model.fov if fov is None else fov
-    check.number(context, "fov", fov, low=0, high=camera_model.widest, open_low=True)
-    if fov < _MIN_FOV_DEGREES:
-        raise ValueError(
-            f"{context}: fov must be at least {_MIN_FOV_DEGREES:g} degrees, got {fov!r}"
-        )
+    fov = camera_model.checked_fov(context, camera_model.fov if fov is None else fov)
     check.integer(context, "width", width, low=1, high=MAX_PICTURE_SIDE)
     check.integer(context, "height", height, low=1, high=MAX_PICTURE_SIDE)
     fx, fy = camera_model.focal(math.radians(fov), width, height)

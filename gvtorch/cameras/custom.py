@@ -188,7 +188,6 @@ class CustomCamera(Camera):
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
         from the `numbers` of the last two frames; see `continued`.
         """
-
         now, before = (
             self._pictures(numbers)[:, ::stride, ::stride].flatten(0, 2)
             for numbers in (now, before)

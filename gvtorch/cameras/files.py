@@ -88,6 +88,8 @@ def read_cameras(
             cameras = _read_colmap(path)
         else:
             cameras = readers[path.suffix](path, width, height)
+        if width is not None and height is not None:
+            cameras = {name: _scaled(camera, width, height) for name, camera in cameras.items()}
     except (KeyError, IndexError, TypeError, ArithmeticError, xml.ParseError) as error:
         message = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise ValueError(f"{path}: can't be read as cameras: {one_line(message)}") from None
@@ -95,9 +97,7 @@ def read_cameras(
         raise ValueError(f"{path}: {one_line(error)}") from None
     if not cameras:
         raise ValueError(f"{path}: has no cameras")
-    if width is None or height is None:
-        return cameras
-    return {name: _scaled(camera, width, height) for name, camera in cameras.items()}
+    return cameras
 
 
 def write_cameras(

@@ -19,6 +19,7 @@ from ..ops import pinhole_rays
 from ..ops.cameras import PinholeColumns
 
 CameraModel = Literal["pinhole", "ortho", "fisheye", "panorama"]
+_MIN_FOV = 1e-12  # degrees; of smaller ones focal lengths would not be finite
 _NEWTON_STEPS = 20  # one that leaves the bracket halves it instead
 _EDGE_TOLERANCE = 1 + 1e-12  # at the edges of fisheye and panorama
 _MAX_HALF_ANGLE = math.radians(45)  # largest half angle that a fitted box spans in a wide view
@@ -141,6 +142,10 @@ class Model(ABC):
     parallel = False
     planar = True
     has_distortion = False
+
+    def checked_fov(self, context: str, fov: float) -> float:
+        """Returns a vertical field of view, degrees; raises ValueError if it is out of range."""
+        return check.number(context, "fov", fov, low=_MIN_FOV, high=self.widest)
 
     def focal(self, fov: float, width: int, height: int) -> tuple[float, float]:
         """Returns fx and fy for a vertical field of view, radians; if parallel, at distance 1."""

@@ -207,7 +207,7 @@ class Exchange:
             attachment = (gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND)
             if depth is not None and not self._attachment_parameter(*attachment):
                 raise RuntimeError(
-                    f"{self._gl.where}: the framebuffer that is bound for drawing has no depth"
+                    f"{self._gl.context}: the framebuffer that is bound for drawing has no depth"
                 )
             self._draw_textures("color", None if depth is None else "depth")
 
@@ -242,7 +242,7 @@ class Exchange:
 
     def _require_context(self, method: str) -> None:
         """Raises unless the exchange is open and its context current."""
-        context = self._gl.where = f"opengl.Exchange.{method}"
+        context = self._gl.context = f"opengl.Exchange.{method}"
         if not self._program:
             raise RuntimeError(f"{context}: the exchange is closed")
         self._gl.require_context()
@@ -291,14 +291,14 @@ class Exchange:
             and color.shape[2] in (3, 4)
         ):
             raise ValueError(
-                f"{self._gl.where}: color must be ({size[0]}, {size[1]}, 3 or 4) uint8, "
+                f"{self._gl.context}: color must be ({size[0]}, {size[1]}, 3 or 4) uint8, "
                 f"float16 or float32, got {check.describe(color)}"
             )
         if depth is not None and not (
             isinstance(depth, Tensor) and depth.is_floating_point() and depth.shape == (*size, 1)
         ):
             raise ValueError(
-                f"{self._gl.where}: depth must be ({size[0]}, {size[1]}, 1) floats, "
+                f"{self._gl.context}: depth must be ({size[0]}, {size[1]}, 1) floats, "
                 f"got {check.describe(depth)}"
             )
         if color.shape[2] == 3:
@@ -351,7 +351,7 @@ class Exchange:
         """
         if not self._gl.integer(gl.READ_FRAMEBUFFER_BINDING):
             return
-        prefix = f"{self._gl.where}: the framebuffer that is bound for reading has"
+        prefix = f"{self._gl.context}: the framebuffer that is bound for reading has"
         kind, object_name, level = (
             self._attachment_parameter(gl.READ_FRAMEBUFFER, attachment, parameter)
             for parameter in (gl.ATTACHED_KIND, gl.ATTACHED_NAME, gl.ATTACHED_LEVEL)
@@ -466,7 +466,7 @@ class _SharedTransfer(_HostTransfer):
         error, *results = getattr(runtime, function)(*arguments)
         if int(error):
             reason = runtime.cudaGetErrorString(error)[1].decode()
-            raise RuntimeError(f"{self._gl.where}: {function}: {reason}")
+            raise RuntimeError(f"{self._gl.context}: {function}: {reason}")
         return results[0] if len(results) == 1 else results
 
 

@@ -150,7 +150,7 @@ class Functions:
 
     def __init__(self, context: str, load: Loader | None = None) -> None:
         """Loads the functions by `load` or from the system's library; raises as `Exchange`."""
-        self.where = context
+        self.context = context
         load = _system_loader(context) if load is None else load
         if not callable(load):
             raise ValueError(f"{context}: load must be a function of a name, got {load!r}")
@@ -171,10 +171,10 @@ class Functions:
         for name, type_codes in functions.items():
             address = load(f"gl{name}")
             if not address:
-                raise RuntimeError(f"{self.where}: this OpenGL lacks gl{name}; 3.2 is needed")
+                raise RuntimeError(f"{self.context}: this OpenGL lacks gl{name}; 3.2 is needed")
             if not isinstance(address, int):
                 raise ValueError(
-                    f"{self.where}: load must give addresses as int, got {address!r} for gl{name}"
+                    f"{self.context}: load must give addresses as int, got {address!r} for gl{name}"
                 )
             prototype: Any = ctypes.CFUNCTYPE(*(_CTYPES[code] for code in type_codes))
             setattr(self, name, prototype(address))
@@ -185,14 +185,14 @@ class Functions:
     def require_context(self) -> None:
         """Raises RuntimeError unless a context is current; clears earlier errors."""
         if not self.GetString(VERSION):
-            raise RuntimeError(f"{self.where}: {_NO_CONTEXT}")
+            raise RuntimeError(f"{self.context}: {_NO_CONTEXT}")
         self.forget_errors()
 
     def check(self, hint: str) -> None:
         """Raises RuntimeError if OpenGL reports an error."""
         if error := self.GetError():
             name = _ERRORS.get(error, hex(error))
-            raise RuntimeError(f"{self.where}: OpenGL says {name} ({hint})")
+            raise RuntimeError(f"{self.context}: OpenGL says {name} ({hint})")
 
     def forget_errors(self) -> None:
         """Clears OpenGL's errors."""
@@ -283,7 +283,7 @@ class Functions:
         self.LinkProgram(program)
         if not self.parameter("GetProgramiv", program, LINK_STATUS):
             self.DeleteProgram(program)
-            raise RuntimeError(f"{self.where}: this OpenGL takes no GLSL 1.50")
+            raise RuntimeError(f"{self.context}: this OpenGL takes no GLSL 1.50")
         return program
 
     @contextmanager

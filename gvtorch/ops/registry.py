@@ -33,6 +33,12 @@ def unavailable() -> dict[str, str]:
     return {"reference": "", **_reasons}
 
 
+def device_of(backend: str) -> torch.device:
+    """Returns the device that a backend runs on; for auto, CUDA if it can be used here."""
+    on_cuda = backend == "cuda" or (backend == "auto" and not unavailable()["cuda"])
+    return torch.device("cuda" if on_cuda else "cpu")
+
+
 @functools.cache
 def choose_backend(backend: str, device: torch.device) -> str:
     """Returns the backend to run on `device`; `auto` is the compiled one where it is available.

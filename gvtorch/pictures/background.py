@@ -101,7 +101,7 @@ class Environment(Background):
         """Takes the map.
 
         Args:
-            image: (h, w, 3) linear RGB, finite and >= 0; values above 1 are kept.
+            image: (h, w, 3) linear RGB, finite; values above 1 are kept.
             rotation: (3, 3) from world directions to those of the map.
 
         Raises:

@@ -31,12 +31,14 @@ _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _BITS = {".png": (8, 16), ".tif": (8, 16, 32), ".exr": (32, 16), ".npy": (32,), ".npz": (32,)}
 
 
-def checked_path(context: str, path: Path, bits: int | None, suffixes: tuple[str, ...]) -> int:
-    """Returns the bits per number of a file to be written; raises ValueError if the ending is
-    unknown or does not allow `bits`, FileNotFoundError if there is no such folder.
+def checked_path(
+    context: str, path: Path, bits: int | None = None, suffixes: tuple[str, ...] = tuple(_BITS)
+) -> int:
+    """Returns the bits per number of a file to be written; raises ValueError if its ending is not
+    one of `suffixes` or does not allow `bits`, FileNotFoundError if there is no such folder.
     """
     if path.suffix not in suffixes:
-        expected = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
+        expected = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
         raise ValueError(f"{context}: path must end in {expected}, got {str(path)!r}")
     allowed_bits = _BITS[path.suffix]
     if bits is not None and bits not in allowed_bits:
@@ -49,7 +51,7 @@ def checked_path(context: str, path: Path, bits: int | None, suffixes: tuple[str
 
 def write_image(path: Path, layers: Layers, *, transparent: bool, bits: int | None = None) -> None:
     """Writes a picture's layers; see `Picture.save`."""
-    bits = checked_path("save", path, bits, (".png", ".npz", ".npy", ".exr", ".tif"))
+    bits = checked_path("save", path, bits)
     with whole_file(path) as part:
         if path.suffix == ".npz":
             np.savez(part, **layers)  # type: ignore[arg-type]

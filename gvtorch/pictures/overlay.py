@@ -153,8 +153,7 @@ class _Pen:
 
         self.size, self._image, self._draw = size, Image, ImageDraw
         self._font: Any = ImageFont.load_default(size)
-        self._rim = max(1, round(size / 9))
-        self._line = max(1, round(size / 9))
+        self._rim = self._line = max(1, round(size / 9))
 
     def _new_sheet(self, width: float, height: float) -> Any:
         sheet = self._image.new("RGBA", (math.ceil(width), math.ceil(height)), (0, 0, 0, 0))

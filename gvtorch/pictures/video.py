@@ -14,7 +14,8 @@ from ..base.messages import need_library
 from ..base.whole_file import whole_file
 from .picture import Picture
 
-FILM_SUFFIXES = [".mp4", ".gif", ".webp"]
+#: Endings of films, and the most pixels of a side that their encoders take.
+FILM_SIDES = {".mp4": 16384, ".gif": 65535, ".webp": 16383}
 _MAX_GIF_FPS = 50  # pictures a second; viewers play faster ones slowly
 _PALETTE_FRAMES = 16  # pictures from which the colours of a GIF are taken
 
@@ -31,8 +32,8 @@ class Video:
 
         Args:
             path: The file: .mp4, .gif or .webp.
-            width: Pixels; even for .mp4.
-            height: Pixels; even for .mp4.
+            width: Pixels, at most those of `FILM_SIDES`; even for .mp4.
+            height: Pixels, likewise.
             fps: Pictures a second; at most 50 for .gif.
 
         Raises:
@@ -42,20 +43,29 @@ class Video:
         """
         self._path, self._size = Path(path), (width, height)
         suffix = self._path.suffix
-        if suffix not in FILM_SUFFIXES:
-            suffixes = ", ".join(FILM_SUFFIXES)
+        if suffix not in FILM_SIDES:
+            suffixes = ", ".join(FILM_SIDES)
             raise ValueError(f"Video: path must end in {suffixes}, got {str(path)!r}")
         if not self._path.parent.is_dir():
             raise FileNotFoundError(f"folder not found: {self._path.parent}")
         check.integer("Video", "fps", fps, low=1, high=_MAX_GIF_FPS if suffix == ".gif" else 1000)
+        for name, pixels in (("width", width), ("height", height)):
+            check.integer("Video", name, pixels, low=1, high=FILM_SIDES[suffix])
         if suffix == ".mp4" and (width % 2 or height % 2):
             raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
-        self._stack = ExitStack()
+        self._stack: ExitStack | None = None  # while the film is open
         is_mp4 = suffix == ".mp4"
         self._film = _Mp4(width, height, fps) if is_mp4 else _LoopingFilm(suffix, fps)
 
     def add(self, picture: Picture) -> None:
-        """Appends a picture; raises ValueError if it is of another size, or a batch."""
+        """Appends a picture.
+
+        Raises:
+            ValueError: It is of another size, or a batch.
+            RuntimeError: This is called outside the `with` block.
+        """
+        if self._stack is None:
+            raise RuntimeError("Video: pictures can be added within its with block only")
         pixels = picture.to_srgb8().numpy()
         width, height = self._size
         if pixels.shape != (height, width, 3):
@@ -63,13 +73,17 @@ class Video:
         self._film.add(pixels)
 
     def __enter__(self) -> Video:
-        self._film.open(self._stack.enter_context(whole_file(self._path)))
-        self._stack.push(lambda error_type, *_: self._film.close(complete=error_type is None))
+        with ExitStack() as stack:  # closes the file if the film can't be opened
+            self._film.open(stack.enter_context(whole_file(self._path)))
+            stack.push(lambda error_type, *_: self._film.close(complete=error_type is None))
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *error: Any) -> None:
         """Finishes the file, or deletes it after an error."""
-        self._stack.__exit__(*error)
+        stack, self._stack = self._stack, None
+        if stack is not None:
+            stack.__exit__(*error)
 
     def __repr__(self) -> str:
         return f"Video({str(self._path)!r}, {self._size[0]}x{self._size[1]})"

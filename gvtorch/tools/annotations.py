@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..cameras import Camera
     from ..pictures import ColorBar, Overlay
     from ..shaders import Shader
-    from ..viewer.state import Eye
+    from ..viewer.state import ViewState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,20 +28,23 @@ class Annotations:
     # write text at the upper left; lines are separated by \n
     annotate: Annotated[str | None, option(metavar="TEXT")] = None
 
-    def overlay(
-        self, shader: Shader, info: ImageInfo, component: int, camera: Camera, eye: Eye
-    ) -> Overlay | None:
-        """Returns the overlay for a camera in the world, or None; its scale holds at the target of
-        `eye`. Raises ValueError if the shader has no bar, the camera no scale, or there is no room.
+    def overlay(self, state: ViewState, info: ImageInfo, camera: Camera) -> Overlay | None:
+        """Returns the overlay for what a state shows from a camera in the world, or None; its scale
+        holds at the target of the state's camera. Raises ValueError if there are slices or costs,
+        the shader has no bar, the camera no scale, or there is no room.
         """
         from ..pictures import Overlay
 
-        if not given_flags(self):
+        flags, eye = given_flags(self), state.camera
+        if not flags:
             return None
+        if not state.is_plain:
+            raise ValueError(f"{flags[0]} is for a picture alone: the view has slices or costs")
+        assert eye is not None
         return Overlay(
             camera.width,
             camera.height,
-            bar=_color_bar(shader, info, component) if self.bar else None,
+            bar=_color_bar(state.shader, info, state.component) if self.bar else None,
             pixel=camera.pixel_width(math.dist(eye.eye, eye.target)) if self.scale_bar else None,
             unit=info.unit,
             text=self.annotate,

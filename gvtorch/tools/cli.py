@@ -152,11 +152,10 @@ class Filter:
     def run(self) -> None:
         from ..io.resources import amount
         from ..io.stores.store import Store
-        from ..ops import unavailable
+        from ..ops.registry import device_of
         from ..shaders import Filtered, Lit
         from .parse import parse_transfer
 
-        on_cuda = self.backend == "cuda" or (self.backend is None and not unavailable()["cuda"])
         start, store = time.perf_counter(), Store.open(self.store)
         bytes_before = store.describe()["disk bytes"]
         with Bar() as bar:
@@ -167,7 +166,7 @@ class Filter:
                     Lit(transfer) if self.lit else transfer,
                     component=self.component,
                     directions={"auto": None, "six": True, "one": False}[self.directions],
-                    device="cuda" if on_cuda else "cpu",
+                    device=device_of(self.backend or "auto"),
                     progress=bar,
                 )
         added = amount(max(0, store.describe()["disk bytes"] - bytes_before))

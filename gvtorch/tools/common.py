@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -139,6 +139,12 @@ def refuse_file_flags(options: ReadOptions, *allowed: str) -> None:
         raise ValueError(f"{flags[0]} is for volume files; a store has it in its metadata")
 
 
+def refuse_store_flags(path: str, flags: Sequence[str]) -> None:
+    """Raises ValueError if flags for stores are given with a volume file."""
+    if flags:
+        raise ValueError(f"{flags[0]} is for stores; make one: gvtorch convert {path} STORE.zarr")
+
+
 def open_data(path: str, options: ReadOptions, *, image: str | None, level: int) -> Volume | Store:
     """Opens a store, or reads a volume; raises ValueError if a flag is for the other kind."""
     from ..io.stores.store import Store
@@ -146,16 +152,15 @@ def open_data(path: str, options: ReadOptions, *, image: str | None, level: int)
     if is_zarr(path):
         refuse_file_flags(options)
         return Store.open(path, image=image, time=options.time or 0)
-    for flag, value in (("image", image), ("level", level)):
-        if value:
-            raise ValueError(f"--{flag} is for stores; make one: gvtorch convert {path} STORE.zarr")
+    refuse_store_flags(path, ["--image"] * bool(image) + ["--level"] * bool(level))
     return options.read(path)
 
 
 def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None]) -> None:
     """Raises ValueError if a command would overwrite a file that it reads, or one in a folder that
-    it reads, or write a file twice. `inputs` and `outputs` map flags to paths; a text in `inputs`
-    may also be FILE:NAME, or no path at all.
+    it reads, or write a file twice, FileNotFoundError if the folder of an output is missing.
+    `inputs` and `outputs` map flags to paths; a text in `inputs` may also be FILE:NAME, or no path
+    at all.
     """
     input_flags: dict[Path, str] = {}
     for flag, text in inputs.items():
@@ -166,6 +171,8 @@ def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None])
     for flag, path in outputs.items():
         if path is None:
             continue
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"{flag}: folder not found: {path.parent}")
         real_path = Path(os.path.realpath(path))
         input_flag = input_flags.get(real_path, input_flags.get(real_path.parent))
         if input_flag is not None:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ..viewer.flight import Flight, KeyFile
     from ..viewer.state import ViewState
 
-_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILM_SUFFIXES"))
+_FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILM_SIDES"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,10 +123,6 @@ class Fly:
     def _check_output(self, options: dict[str, Any]) -> None:
         """Raises ValueError or FileNotFoundError for wrong outputs before the volume is read."""
         is_film = self.output.suffix in _FILM_SUFFIXES
-        if not self.output.parent.is_dir():
-            raise FileNotFoundError(f"folder not found: {self.output.parent}")
-        if self.stats is not None and not self.stats.parent.is_dir():
-            raise FileNotFoundError(f"folder not found: {self.stats.parent}")
         if self.output.suffix and not is_film:
             suffixes = ", ".join(_FILM_SUFFIXES)
             raise ValueError(
@@ -185,9 +181,7 @@ class Fly:
 
         def take_picture(position: float) -> tuple[Camera, Picture]:
             state, camera, picture = render_at(position)
-            assert state.camera is not None
-            overlay_arguments = (state.shader, scene.info, state.component, camera, state.camera)
-            overlay = self.annotation.overlay(*overlay_arguments)
+            overlay = self.annotation.overlay(state, scene.info, camera)
             return camera, picture if overlay is None else overlay.over(picture)
 
         return take_picture
@@ -216,8 +210,9 @@ class Fly:
 
         if self.keys is not None:
             return self._key_file.flight(base_state)
+        fields = self._first_fields
         try:
-            state = base_state.changed(self._first_fields)
+            state = base_state.changed(fields)
         except ValueError as error:
             raise ValueError(f"{self.state}: {one_line(error)}") from None
         return Flight.turntable(state)
@@ -303,7 +298,12 @@ class Fly:
             )
         if self.flight != "orbit":
             raise ValueError("--turntable goes once around: not with --path FILE.json")
-        seconds = check.number("fly", "--turntable", self.turntable, low=0, open_low=True)
+        from ..viewer.flight import MAX_PICTURES
+
+        longest = MAX_PICTURES / fps
+        seconds = check.number(
+            "fly", "--turntable", self.turntable, low=0, high=longest, open_low=True
+        )
         return max(1, round(seconds * fps)), fps
 
     def _check_path(self) -> None:
@@ -318,14 +318,12 @@ class Fly:
             parse_orbit("--orbit", self.orbit)
 
     def _check_poses(self) -> None:
-        """Raises ValueError or FileNotFoundError for a wrong --poses before there are pictures."""
+        """Raises ValueError for a wrong --poses before there are pictures."""
         if self.poses is None:
             return
         is_folder = not self.poses.suffix and not self.poses.is_file()
         if not is_folder and self.poses.suffix != ".json":
             raise ValueError(f"--poses must be a folder or end in .json, got {self.poses}")
-        if not self.poses.parent.is_dir():
-            raise FileNotFoundError(f"folder not found: {self.poses.parent}")
         models = [self.scene.look.camera_model]
         if self._state_file is not None:
             models = [s.camera.model for _, s in self._bare_flight.keys if s.camera is not None]

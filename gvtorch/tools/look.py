@@ -176,23 +176,17 @@ class Look:
             raise ValueError(f"{state_flag} sets what {flags[0]} sets: leave one out")
 
     def device(self) -> torch.device:
-        """Returns the device that the backend needs; for auto, CUDA if it can be used."""
-        import torch
+        """Returns the device that the backend needs; ValueError if it can't be used here."""
+        from ..ops.registry import choose_backend, device_of
 
-        from ..ops import unavailable
-        from ..ops.trace import choose_backend
-
-        wants_cuda = self.backend == "cuda" or (
-            self.backend == "auto" and not unavailable()["cuda"]
-        )
-        device = torch.device("cuda" if wants_cuda else "cpu")
+        device = device_of(self.backend)
         choose_backend(self.backend, device)
         return device
 
     def brick_layout(self, data: Volume | Store) -> tuple[int, int]:
         """Returns the side of a brick, and the voxels around it."""
-        border = 2 if data.info.labels else 1
-        return self.brick_size, border if self.border is None else self.border
+        border = data.info.default_border if self.border is None else self.border
+        return self.brick_size, border
 
     def up_direction(self) -> Up | None:
         """Returns the up direction of `--up`, or None if it is left out."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,10 +24,9 @@ from .streaming import cost_summary
 if TYPE_CHECKING:
     from ..base.records import RenderStats
     from ..cameras import Camera
-    from ..pictures import Overlay, Picture
+    from ..pictures import Picture
     from ..viewer.state import Development, ViewState
 
-PICTURE_SUFFIXES = (".png", ".exr", ".npy", ".npz", ".tif")
 STRIP_SUFFIXES = (".npy", ".tif")  # written strip by strip: the picture may be larger than memory
 
 
@@ -101,7 +101,7 @@ class Render:
                 state = state.read(self.state)
                 name = f"{self.state}: component"
                 scene.info.check_component(name, state.component, scene.data.width)
-            stats = self._write_picture(scene, state, bar)
+            stats = self._write_picture(scene, state, (width, height), bar)
         if self.stats is not None:
             content = {**stats.as_dict(), "extent": scene.data.extent}
             write_text(self.stats, json.dumps(content, indent=2) + "\n")
@@ -130,15 +130,11 @@ class Render:
             flags = given_flags(self.development) + ["--show"] * (self.show != "picture")
             fields = saved_state(self.state)
             self.scene.look.check_state("--state", fields, flags, self.camera)
-        _check_suffix("--output", self.output, *PICTURE_SUFFIXES)
+        checked_path("--output", self.output, self.bits)
         if self.npz is not None:
             if self.output.suffix in STRIP_SUFFIXES:
                 raise ValueError(f"--npz holds a whole picture: not with {self.output.suffix}")
-            _check_suffix("--npz", self.npz, ".npz")
-        for file in (self.output, self.npz, self.stats):
-            if file is not None and not file.parent.is_dir():
-                raise FileNotFoundError(f"folder not found: {file.parent}")
-        checked_path("--output", self.output, self.bits, PICTURE_SUFFIXES)
+            checked_path("--npz", self.npz, suffixes=(".npz",))
         check_outputs(
             {"PATH": self.path, "--state": self.state, **self.scene.look.files()},
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
@@ -150,27 +146,26 @@ class Render:
             if flags:
                 raise ValueError(f"{flags[0]} is for pictures, not for --show {self.show}")
 
-    def _camera(self, scene: RenderedScene, state: ViewState) -> Camera:
+    def _camera(self, scene: RenderedScene, state: ViewState, size: tuple[int, int]) -> Camera:
         """Returns the camera of the state, or else that of --camera."""
         from ..viewer.slices import panes
 
-        width, height = parse_size(self.size)
-        if state.slices is not None:
-            _, _, width, height = panes(width, height)["view"]
+        width, height = size if state.slices is None else panes(*size)["view"][2:]
         if state.camera is None:
             return parse_camera(self.camera, self.scene.look, width, height, scene.info.space)
         return state.camera.camera(width, height, scene.box)
 
-    def _write_picture(self, scene: RenderedScene, state: ViewState, bar: Bar) -> RenderStats:
+    def _write_picture(
+        self, scene: RenderedScene, state: ViewState, size: tuple[int, int], bar: Bar
+    ) -> RenderStats:
         """Renders and writes what the state shows, strip by strip where the file format allows
         it; a saved state may add slices beside the picture and costs over it.
         """
         from ..pictures import render_tiles
+        from ..viewer.state import Eye
 
-        if state.composed and (flags := given_flags(self.annotation)):
-            raise ValueError(f"{flags[0]} is for a picture alone: {self.state} has slices or costs")
-        camera, is_plain = self._camera(scene, state), state.show == "picture" and not state.slices
-        needs_whole = self.npz is not None or not is_plain
+        camera = self._camera(scene, state, size)
+        needs_whole = self.npz is not None or not state.is_plain
         strips = not needs_whole and in_strips(self.output.suffix, camera.width, camera.height)
         render = scene.render if strips else partial(scene.render, progress=bar)
         anything_seen = False
@@ -181,7 +176,9 @@ class Render:
             anything_seen = anything_seen or bool(picture.alpha.any())
             return picture
 
-        overlay = self._overlay(scene, state, camera)
+        placed = camera.placed(scene.box)
+        eye = Eye.of(placed, scene.box) if state.camera is None else state.camera
+        overlay = self.annotation.overlay(replace(state, camera=eye), scene.info, placed)
         if strips:
             stats = render_tiles(
                 *(take, camera, self.output), bits=self.bits, overlay=overlay, progress=bar
@@ -192,28 +189,20 @@ class Render:
             if state.slices is not None:
                 from ..viewer.slices import Planes
 
-                planes = Planes(scene.data, lambda problem: None)
-                canvas = planes.composed(canvas, state, *parse_size(self.size), wait=True).picture
-                planes.close()
+                with closing(Planes(scene.data, lambda problem: None)) as planes:
+                    canvas = planes.composed(canvas, state, *size, wait=True).picture
             canvas = canvas if overlay is None else overlay.over(canvas)
             canvas.save(self.output, bits=self.bits)
             if self.npz is not None:
                 picture.save(self.npz)
             stats = picture.stats
-        if is_plain and not anything_seen:
+        if state.is_plain and not anything_seen:
             limits = getattr(scene.data, "value_range", None)
             if isinstance(limits, list):  # a store has one for each channel
                 limits = limits[state.component]
             note = "" if limits is None else f": values range from {limits[0]:g} to {limits[1]:g}"
             warnings.warn(f"nothing is seen{note}", stacklevel=2)
         return stats
-
-    def _overlay(self, scene: RenderedScene, state: ViewState, camera: Camera) -> Overlay | None:
-        from ..viewer.state import Eye
-
-        eye = Eye.of(camera, scene.box) if state.camera is None else state.camera
-        placed = camera.placed(scene.box)
-        return self.annotation.overlay(state.shader, scene.info, state.component, placed, eye)
 
 
 def in_strips(suffix: str, width: int, height: int) -> bool:
@@ -223,8 +212,3 @@ def in_strips(suffix: str, width: int, height: int) -> bool:
 
     rows = strip_rows(check.nbytes("render", "memory", STRIP), width, height)
     return suffix in STRIP_SUFFIXES or (suffix == ".png" and rows < height)
-
-
-def _check_suffix(flag: str, path: Path, *suffixes: str) -> None:
-    if path.suffix not in suffixes:
-        raise ValueError(f"{flag} must end in {', '.join(suffixes)}, got {str(path)!r}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, ReadOptions, given_flags, option, refuse_file_flags
+from .common import Bar, ReadOptions, given_flags, option, refuse_file_flags, refuse_store_flags
 from .look import Look
 from .streaming import Streaming, print_failures
 
@@ -57,9 +57,8 @@ class RenderedScene:
         """Returns what a state shows from the given camera, without planes beside it: the picture
         (`picture`, if it is already rendered), or costs in its place or blended over it.
         """
-        # The picture is rendered first: costs of a store are those of the data that it loaded.
         developed = state.taken(self.render, camera) if picture is None else picture
-        return state.with_costs(lambda: developed, lambda: state.cost_picture(self.cost, camera))
+        return state.with_costs(developed, lambda: state.cost_picture(self.cost, camera))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +83,7 @@ class SceneFlags:
             with self._stream(path, options) as scene:
                 yield scene
             return
-        flags = given_flags(self.streaming)
-        if flags:
-            raise ValueError(
-                f"{flags[0]} is for stores; make one: gvtorch convert {path} STORE.zarr"
-            )
+        refuse_store_flags(path, given_flags(self.streaming))
         yield self._resident(path, options, bar)
 
     def _resident(self, path: str, options: dict[str, Any], bar: Bar) -> RenderedScene:

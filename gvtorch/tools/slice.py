@@ -12,7 +12,6 @@ from tyro.conf import Positional
 from ..base.messages import printable
 from .common import Bar, ReadOptions, check_outputs, open_data, option, volume_formats
 from .parse import parse_transfer, parse_window
-from .render import PICTURE_SUFFIXES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +55,7 @@ class Slice:
         from ..tracing import slice_picture
         from ..tracing.slices import radiological_views
 
-        checked_path("--output", self.output, self.bits, PICTURE_SUFFIXES)
+        checked_path("--output", self.output, self.bits)
         check_outputs({"PATH": self.path, "--tf": self.tf}, {"--output": self.output})
         positions: Any = tuple(self.position.split(","))
         if len(positions) not in ((1, 3) if self.axis == "all" else (1,)):

@@ -11,7 +11,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..io.stores.ngff import is_zarr
-from .common import Bar, given_flags, option, volume_formats
+from .common import Bar, given_flags, option, refuse_store_flags, volume_formats
 from .look import parse_camera
 from .scene import SceneFlags
 
@@ -62,7 +62,8 @@ class View:
         aiohttp_web()
         if self.state is not None:
             state = saved_state(self.state)
-            self.scene.look.check_state("--state", state, camera=self.camera)
+            flags = ["--time"] * ("time" in state and self.scene.source.time is not None)
+            self.scene.look.check_state("--state", state, flags, self.camera)
         scene, shader, camera, options = self._open_path()
         view(
             *(scene, shader, camera),
@@ -79,14 +80,16 @@ class View:
         """Returns the scene, its shader, its camera, and fields of `RenderOptions`."""
         if self.path.endswith(".py"):
             return self._run_script()
+        from ..viewer.view import ASPECT
+
         look = self.scene.look
-        parse_camera(self.camera, look, 16, 9)
+        parse_camera(self.camera, look, *ASPECT)  # raises before the data are read
         options = look.options()
         source = replace(self.scene.source, time=self.scene.source.time or 0)
         with Bar() as bar:
             bar("reading", 0, 0)
             scene, shader = self._make_scene(replace(self.scene, source=source))
-        return scene, shader, parse_camera(self.camera, look, 16, 9, scene.info.space), options
+        return scene, shader, parse_camera(self.camera, look, *ASPECT, scene.info.space), options
 
     def _make_scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
         """Returns the scene of a page, at a time point, and its shader."""
@@ -96,6 +99,10 @@ class View:
         from ..viewer.scene import Scene, series_of
 
         look, streaming = flags.look, flags.streaming
+        given = given_flags(streaming)
+        for flag in ("--mode", "--max-frames"):
+            if flag in given:
+                raise ValueError(f"{flag} is for single pictures: a page refines its own")
         data: Volume | Store
         if is_zarr(self.path):
             data = store = flags.open_store(self.path)
@@ -106,6 +113,8 @@ class View:
 
             series = series_of(store)
         else:
+            store_flags = [flag for flag in given if flag in ("--image", "--host-cache")]
+            refuse_store_flags(self.path, store_flags)
             data = flags.source.read(self.path)
             shader = look.make_shader(data)
             filtered = shader if isinstance(shader, Filtered) else None

@@ -192,7 +192,8 @@ class Client:
         self._draft_key, self._progressive = (self.eye, self.size), None
         self._settled, self._unchanged_frames = False, 0
         quality = _FINAL_QUALITY if size[0] * size[1] <= _CHEAP_PIXELS else _DRAFT_QUALITY
-        self._show_picture(picture, camera, state, quality, elapsed_ms, final=False)
+        self.picture, self._camera = picture, camera
+        self._send_picture(state.develop.develop(picture), state, quality, elapsed_ms, final=False)
         return picture
 
     def _update_costs(self, picture: Picture, elapsed_ms: float, pixels: int) -> None:
@@ -214,14 +215,15 @@ class Client:
         camera, start = self.eye.camera(width, height, scene.box), time.perf_counter()
         if state.show != "picture":
             camera = self.eye.camera(max(1, width // 2), max(1, height // 2), scene.box)
+            drawn = scene.frame(camera, state, stop_if_outdated)  # requests what is missing
             picture = state.with_costs(
-                lambda: state.develop.develop(scene.frame(camera, state, stop_if_outdated)),
-                lambda: scene.cost(camera, state, stop_if_outdated),
+                state.develop.develop(drawn), lambda: scene.cost(camera, state, stop_if_outdated)
             )
-            self._finished = True
-            self._show_picture(
-                picture, camera, state, _FINAL_QUALITY, 1e3 * (time.perf_counter() - start)
-            )
+            self._update_settled(scene, drawn)
+            self._finished = self._settled
+            elapsed_ms = 1e3 * (time.perf_counter() - start)
+            self.picture, self._camera = picture, camera
+            self._send_picture(picture, state, _FINAL_QUALITY, elapsed_ms, self._finished)
             return picture
         if self._progressive is None:
             self._progressive = Progressive(
@@ -231,10 +233,7 @@ class Client:
             self._progressive.reset()  # missing data may be there now
         picture = self._progressive.frame(camera)
         elapsed_ms = 1e3 * (time.perf_counter() - start)
-        if not self._settled:
-            self._unchanged_frames = self._unchanged_frames + 1 if scene.settled(picture) else 0
-            converged = getattr(picture.stats, "converged", True)
-            self._settled = converged or self._unchanged_frames >= _UNCHANGED_FRAMES
+        self._update_settled(scene, picture)
         count = self._progressive.count if self._settled else 0
         self._finished = count >= state.develop.samples
         is_milestone = count & (count - 1) == 0 and self._settled
@@ -244,23 +243,17 @@ class Client:
             or time.monotonic() - self._last_sent_time > _SHOW_SECONDS
             or not self._settled
         ):
-            self._show_picture(
-                picture, camera, state, _FINAL_QUALITY, elapsed_ms, final=self._finished
-            )
+            self.picture, self._camera = picture, camera
+            developed = state.develop.develop(picture)
+            self._send_picture(developed, state, _FINAL_QUALITY, elapsed_ms, self._finished)
         return picture
 
-    def _show_picture(
-        self,
-        picture: Picture,
-        camera: Camera,
-        state: ViewState,
-        quality: int,
-        elapsed_ms: float,
-        final: bool = True,
-    ) -> None:
-        self.picture, self._camera = picture, camera
-        shown = picture if state.show != "picture" and final else state.develop.develop(picture)
-        self._send_picture(shown, state, quality, elapsed_ms, final)
+    def _update_settled(self, scene: Scene, picture: Picture) -> None:
+        """Notes whether a frame shows all data, or frames no longer bring any."""
+        if not self._settled:
+            self._unchanged_frames = self._unchanged_frames + 1 if scene.settled(picture) else 0
+            converged = getattr(picture.stats, "converged", True)
+            self._settled = converged or self._unchanged_frames >= _UNCHANGED_FRAMES
 
     def _send_picture(
         self, shown: Picture, state: ViewState, quality: int, elapsed_ms: float, final: bool

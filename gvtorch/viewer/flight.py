@@ -31,7 +31,7 @@ from ..cameras.motion import Motion
 from .state import Eye, ViewState, saved_state
 
 Curve = Callable[[float], Any]
-_MAX_PICTURES = 2**31  # most pictures of a film
+MAX_PICTURES = 2**31  # most pictures of a film
 _TURN_KEYS = 4  # keys of a turntable: between them the camera turns, so that the circle is exact
 #: Fields whose numbers increase along an axis, and must do so between keys too.
 _INCREASING_FIELDS = {
@@ -169,10 +169,10 @@ class Flight:
     def count(self, fps: float = 25) -> int:
         """Returns the number of pictures of a film."""
         fps = check.number("Flight", "fps", fps, low=0, open_low=True)
-        if self.seconds * fps > _MAX_PICTURES:
+        if self.seconds * fps > MAX_PICTURES:
             raise ValueError(
                 f"Flight: {self.seconds:g} s of {fps:g} pictures each are more than "
-                f"{_MAX_PICTURES} pictures"
+                f"{MAX_PICTURES} pictures"
             )
         return max(1, round(self.seconds * fps) + (not self.closed))
 

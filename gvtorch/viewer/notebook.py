@@ -34,17 +34,22 @@ export default {
     root.className = "gv";
     root.style.height = `${model.get("height")}px`;
     el.append(root);
+    const listeners = {};
     const connect = (receive, onLost) => {
-      model.on("msg:custom", (content, buffers) => {
+      listeners["msg:custom"] = (content, buffers) => {
         if (content.gone) onLost(content.gone);
         else receive(buffers.length ? buffers[0] : content.text);
-      });
-      model.on("comm_live_update", () => onLost("The notebook's kernel has ended."));
+      };
+      listeners["comm_live_update"] = () => onLost("The notebook's kernel has ended.");
+      for (const [event, listener] of Object.entries(listeners)) model.on(event, listener);
       return (text) => model.send({ text });
     };
     mount(root, connect);
     model.send({ joined: true });
-    return () => model.send({ joined: false });
+    return () => {
+      for (const [event, listener] of Object.entries(listeners)) model.off(event, listener);
+      model.send({ joined: false });
+    };
   },
 };
 """
@@ -80,7 +85,8 @@ def widget(session: Session) -> Any:
         def __init__(self, session: Session, **options: Any) -> None:
             super().__init__(**options)
             self.session = session
-            self._client: Client | None = None
+            self._client: Client | None = None  # for all cells that show it
+            self._cells = 0  # that show it
             self.on_msg(self._receive)
             self._loop: asyncio.AbstractEventLoop | None = None  # running in this thread
             with contextlib.suppress(RuntimeError):
@@ -88,9 +94,12 @@ def widget(session: Session) -> Any:
 
         def _receive(self, _widget: Any, content: Any, _buffers: Any) -> None:
             if content.get("joined") is not None:
-                if self._client is not None:
+                self._cells = max(0, self._cells + (1 if content["joined"] else -1))
+                if self._client is not None and (content["joined"] or not self._cells):
                     self.session.leave(self._client)
-                self._client = self.session.join(self._post) if content["joined"] else None
+                    self._client = None
+                if content["joined"]:
+                    self._client = self.session.join(self._post)  # which welcomes all cells
             elif self._client is not None and isinstance(content.get("text"), str):
                 self.session.receive(self._client, content["text"])
 

@@ -11,9 +11,10 @@ from typing import Any, get_type_hints
 
 import torch
 
+from ..base import check
 from ..producers import Producer
 from .scene import Scene
-from .schema import control_for, decode, encode
+from .schema import arguments, control_for, decode, encode
 
 _MAX_NUMBERS = 16  # most numbers of a parameter that gets a control
 
@@ -39,14 +40,20 @@ class Parameters:
         Raises:
             ValueError: It takes something else, or returns no producer.
         """
-        hints, names = get_type_hints(make), [*inspect.signature(make).parameters]
+        try:
+            hints, names = get_type_hints(make), [*inspect.signature(make).parameters]
+        except (TypeError, ValueError, NameError):  # of what has no hints or no signature
+            hints, names = {}, []
         kind = hints.get(names[0]) if len(names) == 1 else None
-        if not (isinstance(kind, type) and is_dataclass(kind)):
-            raise ValueError("view: a function must take one argument, annotated with a dataclass")
+        if not (isinstance(kind, type) and is_dataclass(kind)) or any(
+            default is inspect.Parameter.empty for _, default in arguments(kind).values()
+        ):
+            raise ValueError(
+                "view: a function must take one argument, annotated with a dataclass whose fields "
+                f"all have defaults, got {make!r:.80}"
+            )
         record = kind()
-        producer = make(record)
-        if not isinstance(producer, Producer):
-            raise ValueError(f"view: {make.__name__} must give a Producer, got {producer!r:.80}")
+        producer = check.instance("view", "result of the function", make(record), Producer)
         return cls(producer, record, make)
 
     def describe(self) -> dict[str, Any] | None:

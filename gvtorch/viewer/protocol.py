@@ -86,7 +86,7 @@ class Histogram:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """Asks for a named transfer function over a window."""
+    """Asks for a named transfer function over a window; those in Hounsfield units ignore it."""
 
     name: str
     low: float | None = None

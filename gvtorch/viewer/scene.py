@@ -20,12 +20,12 @@ from ..base.image_info import ImageInfo
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable, to_numpy
 from ..cameras import Camera
-from ..engine import Engine, EngineOptions, FrameStats
+from ..engine import Engine, FrameStats
 from ..io.reading import open_source, read_volume
 from ..io.stores.ngff import is_zarr
 from ..io.stores.store import Store
 from ..io.window import sample_values, window
-from ..ops import unavailable
+from ..ops.registry import device_of
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..producers import Producer, StoredProducer, VolumeProducer
@@ -225,18 +225,14 @@ class Scene:
     def set_clocks(self, time: float) -> None:
         """Sets the time of the producers that have a clock; what differs is produced again."""
         for producer in self._clocks():
-            producer.time = time
+            if producer.time != time:
+                producer.time = time
         self.time = time
 
     def show_time(self, time: float, data: Volume | Store) -> None:
         """Shows another time point of a series: `data` is what `reopen` returned."""
-        old_data, self.data = self.data, data
-        try:
-            self.resize()
-        except (ValueError, RuntimeError):
-            self.data = old_data
-            raise
-        self.time = time
+        self._restart(self.remake, data)
+        self.data, self.time = data, time
 
     def failures(self) -> list[str]:
         """Returns messages on what could not be produced, the newest last."""
@@ -255,17 +251,26 @@ class Scene:
             ValueError: The engine belongs to the caller; or it refuses the options, and is
                 recreated with the old ones.
         """
-        if self.engine is None or self.remake is None:
+        self._restart(remake or self.remake, self.data, **options)
+        if remake is not None:
+            self.remake = remake
+            self.set_clocks(self.time)
+
+    def _restart(self, remake: Remake | None, data: Volume | Store | None, **options: Any) -> None:
+        """Closes the engine and makes another of what `remake` makes of `data`; if that fails,
+        makes the old one again and raises.
+        """
+        if self.engine is None or self.remake is None or remake is None:
             raise ValueError("view: the engine was passed in: its owner sets its memory")
         old_options = self.engine.options
         new_options = replace(old_options, **options)
+        producer = remake(data)
         self.engine.close()
         try:
-            self.engine = Engine((remake or self.remake)(self.data), **vars(new_options))
-        except (ValueError, RuntimeError):
+            self.engine = Engine(producer, **vars(new_options))
+        except Exception:
             self.engine = Engine(self.remake(self.data), **vars(old_options))
             raise
-        self.remake = remake or self.remake
 
     def settled(self, picture: Picture) -> bool:
         """Returns whether a picture shows all data that can be loaded."""
@@ -298,8 +303,7 @@ def open_scene(what: Any, **options: Any) -> Scene:
             raise ValueError(f"view: {next(iter(options))} is set where the scene is made already")
         return Scene(repr(what), *((what, None) if isinstance(what, Engine) else (None, what)))
     options.setdefault("time_budget", _BUDGET_MS)
-    if "device" not in options and not unavailable()["cuda"]:
-        options["device"] = "cuda"
+    options.setdefault("device", device_of("auto"))
     if isinstance(what, Mapping) and all(
         isinstance(producer, Producer) for producer in what.values()
     ):
@@ -307,7 +311,7 @@ def open_scene(what: Any, **options: Any) -> Scene:
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
     data, series = _open_data(what), series_of(what)
-    options.setdefault("border", 2 if data.info.labels else EngineOptions.border)
+    options.setdefault("border", data.info.default_border)
     engine = Engine(_producer_of(data), **options)
     return Scene(data.name, engine, data=data, remake=_producer_of, **series)
 

@@ -40,7 +40,7 @@ from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 
 MAX_ITEMS = 4096  # of a list
 _MAX_NUMBERS = 4 * MAX_ITEMS  # of an array: a row of a transfer function has four
-MAX_DEPTH = 16  # of objects in objects
+_MAX_DEPTH = 16  # of objects in objects
 
 #: Classes that JSON may name, by name.
 KINDS: dict[str, type] = {
@@ -130,6 +130,8 @@ def encode(value: Any) -> Any:
         value = value.tolist() if is_small else _kept_marker(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
+    elif isinstance(value, (Mapping, list, tuple, range)) and len(value) > MAX_ITEMS:
+        value = _kept_marker(value)
     elif isinstance(value, Mapping):
         value = {str(name): encode(item) for name, item in value.items()}
     elif isinstance(value, (list, tuple, range)):
@@ -177,8 +179,8 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
     Raises:
         ValueError: The content is not of the type, or the object refuses it.
     """
-    if depth > MAX_DEPTH:
-        raise ValueError(f"{path}: objects in objects in objects, more than {MAX_DEPTH}")
+    if depth > _MAX_DEPTH:
+        raise ValueError(f"{path}: objects in objects in objects, more than {_MAX_DEPTH}")
     if isinstance(content, dict) and set(content) == {"kept"}:
         if current is not None:
             return current
@@ -305,9 +307,10 @@ def _decode_mapping(path: str, hint: Any, content: Any, depth: int) -> Any:
     decoded = {}
     for name, item in content.items():
         try:
-            decoded[key_type(name)] = decode(f"{path}.{name}", value_hint, item, None, depth + 1)
-        except (TypeError, ValueError) as error:
+            key = key_type(name)
+        except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+        decoded[key] = decode(f"{path}.{name}", value_hint, item, None, depth + 1)
     return decoded
 
 

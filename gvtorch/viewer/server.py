@@ -19,8 +19,9 @@ from collections.abc import Iterable
 from concurrent.futures import Future
 from importlib import resources
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import urlencode, urlsplit
 
+from ..base import check
 from ..base.messages import need_library
 from .protocol import MAX_MESSAGE_BYTES
 from .session import Session
@@ -83,17 +84,21 @@ class Server:
         only this machine can reach the host.
 
         Raises:
-            ValueError: The host needs a token.
+            ValueError: The host needs a token, or an argument is of another type.
             OSError: The port is taken, or the host is not this machine's.
             ImportError: aiohttp is missing.
         """
-        self._session, self._host = session, host
+        self._session, self._host = session, check.instance("view", "host", host, str)
+        token = check.text("view", "token", token)
         self.token = secrets.token_urlsafe(18) if token is None else token
         if not self.token and host not in _LOCAL_HOSTS:
             raise ValueError(f"view: a token is needed where others reach {host!r}")
-        self._allowed_hosts = {*_LOCAL_HOSTS, host, *allow}
+        if isinstance(allow, str):
+            raise ValueError(f"view: allow must be a list of names, got {allow!r}")
+        names = [*_LOCAL_HOSTS, host, *allow]
         if host not in _LOCAL_HOSTS:
-            self._allowed_hosts |= {socket.gethostname(), socket.getfqdn()}
+            names += [socket.gethostname(), socket.getfqdn()]
+        self._allowed_hosts = {name.lower() for name in names}  # as `is_allowed` compares them
         self.port = port
         self._web, self._files = aiohttp_web(), page_files()
         self._sockets: set[Any] = set()
@@ -110,7 +115,8 @@ class Server:
         anywhere = self._host in ("0.0.0.0", "::")
         host = socket.gethostname() if anywhere else self._host
         host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        query = f"?{urlencode({'token': self.token})}" if self.token else ""
+        return f"http://{host}:{self.port}/{query}"
 
     def close(self) -> None:
         """Stops the server."""

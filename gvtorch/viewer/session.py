@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..base.messages import one_line
+from ..base.units import unit_symbol
 from ..base.volume import Volume
 from ..cameras.models import MODELS
 from ..engine import EngineOptions
@@ -32,7 +33,7 @@ from .scene import Scene, node_boxes
 from .schema import KINDS, decode, describe_kind, encode
 from .slices import Planes
 from .state import Development, Eye, Slices, ViewState, transfer_of
-from .still import Steps, Stills, finished_picture, still_steps
+from .still import Steps, Stills, still_steps
 
 _TICK_SECONDS = 0.02  # seconds between checks whether a camera has come to rest
 _FIGURES_SECONDS = 0.25  # seconds between figures for monitors
@@ -44,9 +45,8 @@ _ENGINE_OPTIONS = (
     "time_budget",
     "loading",
 )
-_COLOR_MAPS = (
-    *("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "coolwarm", "bone", "hot"),
-)
+#: Of matplotlib: a page offers them beside the presets, and keeps its opacity when one is chosen.
+_COLOR_MAPS = ("viridis", "magma", "inferno", "plasma", "cividis", "turbo", "coolwarm")
 
 
 class Session:
@@ -64,10 +64,10 @@ class Session:
         """Takes a scene, which only the session's thread uses from now on."""
         self.scene, self.state, self.parameters = scene, state, parameters
         self.clients: dict[int, Client] = {}
-        self.errors = 0  # pictures that failed
         self._last_good_state = state  # the last state that was drawn
         self._client_count, self._last_drawn_client = 0, 0
         self._tasks: deque[Callable[[], None]] = deque()
+        self._questions: set[Future[Any]] = set()  # of `ask`, without an answer
         self._stills = Stills()
         self._wake = threading.Condition()
         self._closed = False
@@ -120,7 +120,12 @@ class Session:
             self._wake.notify()
 
     def ask(self, question: Callable[[], Any], timeout: float = 60.0) -> Any:
-        """Runs a function in the thread that renders; waits for its result and returns it."""
+        """Runs a function in the thread that renders; waits for its result and returns it.
+
+        Raises:
+            RuntimeError: The view is closed, or closes before it runs the function.
+            TimeoutError: There is no result after `timeout` seconds.
+        """
         future: Future[Any] = Future()
 
         def run_question() -> None:
@@ -129,10 +134,14 @@ class Session:
             except Exception as error:
                 future.set_exception(error)
 
-        if self._closed:
-            raise RuntimeError("view: it is closed")
-        self.post(run_question)
-        if not wait([future], timeout).done:
+        with self._wake:
+            if self._closed:
+                raise RuntimeError("view: it is closed")
+            self._questions.add(future)
+            self.post(run_question)
+        is_done = bool(wait([future], timeout).done)
+        self._questions.discard(future)
+        if not is_done:
             raise TimeoutError("view: no answer")
         return future.result()
 
@@ -153,10 +162,15 @@ class Session:
             pass
         if self._planes is not None:
             self._planes.close()
+        if self._export is not None:
+            self._export.end()
         for client in self.clients.values():
             client.end()
         self.clients.clear()
         self._tasks.clear()
+        for future in list(self._questions):
+            if not future.done():
+                future.set_exception(RuntimeError("view: it is closed"))
         self._stills.clear()
         self.scene.close()
 
@@ -192,30 +206,29 @@ class Session:
         self._last_drawn_client = client.number
         try:
             picture = client.draw(self.scene, self.state, self._is_outdated, self._planes)
-        except Exception as error:
+            if picture is None:
+                return
+            self._last_good_state = self.state
+            self._send_nodes(client)
+            self._broadcast_busy(picture)
+            self._broadcast_failures()
+            if client.monitor and time.monotonic() - self._figures_time > _FIGURES_SECONDS:
+                self._figures_time = time.monotonic()
+                client.send_message("figures", **self._frame_figures(picture))
+        except Exception as error:  # whatever it was, the view goes on
             self._report_failure(client, error)
-            return
-        if picture is None:
-            return
-        self._last_good_state = self.state
-        self._send_nodes(client)
-        self._broadcast_busy(picture)
-        self._broadcast_failures()
-        if client.monitor and time.monotonic() - self._figures_time > _FIGURES_SECONDS:
-            self._figures_time = time.monotonic()
-            client.send_message("figures", **self._frame_figures(picture))
 
     def _is_outdated(self) -> bool:
         return bool(self._tasks) or self._closed
 
     def _report_failure(self, client: Client, error: Exception) -> None:
         """Reports why a picture failed, and returns to the last state that was drawn."""
-        self.errors += 1
         self._broadcast("error", text=one_line(error))
         if self._last_good_state is not self.state:
             self.state = self._last_good_state
             self._broadcast_state(None)
             self._restart_pictures()
+            self._update_time()
         else:
             client.pause()
 
@@ -277,7 +290,7 @@ class Session:
             client=client.number,
             name=self.scene.name,
             box=box,
-            unit=info.unit,
+            unit=unit_symbol(info.unit),
             time=self.scene.describe_time(),
             labels=self.scene.describe_labels(),
             channels=[channel.name for channel in info.channels],
@@ -321,8 +334,10 @@ class Session:
             take(client, message)
         except (ValueError, OSError, ImportError, RuntimeError) as error:
             client.send_message("refused", text=one_line(error))
-            if isinstance(message, protocol.Change):
+            if isinstance(message, protocol.Change):  # the page has changed its copies already
                 client.send_message("state", **self._state_content())
+                if message.state.get("camera") is not None:
+                    client.send_message("camera", camera=encode(client.eye))
 
     def _take_hello(self, client: Client, message: protocol.Hello) -> None:
         client.resized(message.width, message.height, message.rate)
@@ -345,20 +360,23 @@ class Session:
                     follower.send_message("camera", camera=encode(eye))
 
     def _take_change(self, client: Client, message: protocol.Change) -> None:
-        content = message.state
-        camera = content.pop("camera", None) if isinstance(content, dict) else None
-        state = self.state.changed(content)
+        content = {name: value for name, value in message.state.items() if name != "camera"}
+        camera, eye = message.state.get("camera"), client.eye
         if camera is not None:
-            self._move_camera(client, decode("camera", Eye, camera, client.eye), not message.rest)
-            client.send_message("camera", camera=encode(client.eye))
-        if not content:
-            return
+            eye = decode("camera", Eye, camera, eye)
+        state = self.state.changed(content)
+        left_out: list[str] = []
         if type(state.shader) is not type(self.state.shader):
             state, left_out = trimmed(state)
-            for reason in left_out:
-                client.send_message("note", text=f"left out: {reason}")
         self.scene.check_state(state)
         self._open_planes(state)
+        if camera is not None:  # nothing was refused
+            self._move_camera(client, eye, not message.rest)
+            client.send_message("camera", camera=encode(eye))
+        if not content:
+            return
+        for reason in left_out:
+            client.send_message("note", text=f"left out: {reason}")
         before, self.state = self.state, state
         self._broadcast_state(client if not message.rest else None)
         shows_planes = state.slices is not None and before.slices is not None
@@ -403,14 +421,18 @@ class Session:
         try:
             data = self.scene.reopen(int(time_point))
         except Exception as error:  # whatever it was, the view goes on
-            text = f"time {time_point:g}: {one_line(error)}"
-            self.post(lambda: self._time_failed(text))
+            failure = error
+            self.post(lambda: self._time_failed(time_point, failure))
         else:
             self.post(lambda: self._time_arrived(time_point, data))
 
     def _time_arrived(self, time_point: float, data: Volume | Store) -> None:
         self._pending_time = None
-        self.scene.show_time(time_point, data)
+        try:
+            self.scene.show_time(time_point, data)
+        except Exception as error:  # whatever it was, the view goes on
+            self._time_failed(time_point, error)
+            return
         if self._planes is not None:
             self._planes.close()
             self._planes = None
@@ -418,11 +440,11 @@ class Session:
         self._restart_pictures()
         self._update_time()
 
-    def _time_failed(self, text: str) -> None:
+    def _time_failed(self, time_point: float, error: Exception) -> None:
         """Sets the state back to the time that is shown."""
         self._pending_time = None
         self.state = replace(self.state, time=self.scene.time)
-        self._broadcast("error", text=text)
+        self._broadcast("error", text=f"time {time_point:g}: {one_line(error)}")
         self._broadcast_state(None)
 
     def _take_pick(self, client: Client, message: protocol.Pick) -> None:
@@ -434,8 +456,11 @@ class Session:
         client.send_message("histogram", in_view=message.in_view, **histogram)
 
     def _take_preset(self, client: Client, message: protocol.Preset) -> None:
-        function = TransferFunction.preset(message.name, message.low, message.high)
-        client.send_message("preset", name=message.name, function=encode(function))
+        name = message.name
+        limits = (None, None) if name in CT_PRESETS else (message.low, message.high)
+        function = TransferFunction.preset(name, *limits)
+        colors_only = name in _COLOR_MAPS
+        client.send_message("preset", name=name, function=encode(function), colors_only=colors_only)
 
     def _take_read(self, client: Client, message: protocol.Read) -> None:
         arguments = message.file, message.text, message.name, message.low, message.high
@@ -519,7 +544,9 @@ class Session:
 
     def still(self, eye: Eye, width: int, height: int) -> Picture:
         """Renders a finished picture: nothing missing, all samples."""
-        return finished_picture(self._still_steps(eye, (width, height), lambda: False))
+        *_, picture = self._still_steps(eye, (width, height), lambda: False)
+        assert picture is not None
+        return picture
 
     def _still_steps(self, eye: Eye, size: tuple[int, int], has_left: Callable[[], bool]) -> Steps:
         return still_steps(

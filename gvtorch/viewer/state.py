@@ -31,6 +31,7 @@ from .schema import decode, encode
 
 Triple = tuple[float, float, float]
 _MAX_COORDINATE = 1e30  # largest coordinate, so that a ray's numbers stay finite
+_MIN_DISTANCE = 1e-100  # from eye to target, so that its square does not become 0
 Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
 
 
@@ -56,11 +57,10 @@ class Eye:
     def __post_init__(self) -> None:
         for name in ("eye", "target", "up"):
             object.__setattr__(self, name, check.triple("Eye", name, getattr(self, name)))
-        widest = model_of("Eye", self.model).widest
-        check.number("Eye", "fov", self.fov, low=0, high=widest, open_low=True)
+        model_of("Eye", self.model).checked_fov("Eye", self.fov)
         if max(abs(number) for number in (*self.eye, *self.target, *self.up)) > _MAX_COORDINATE:
             raise ValueError(f"Eye: eye, target and up must be at most {_MAX_COORDINATE:g}")
-        if self.eye == self.target or not any(self.up):
+        if math.dist(self.eye, self.target) < _MIN_DISTANCE or not any(self.up):
             raise ValueError("Eye: eye and target must differ, and up must not be zero")
 
     def camera(self, width: int, height: int, box: Tensor) -> Camera:
@@ -115,12 +115,12 @@ class Eye:
 
     def fitted(self, box: Tensor, width: int, height: int) -> Self:
         """Returns the eye that looks the same way and sees the whole (2, 3) box."""
-        forward = torch.tensor(self.target) - torch.tensor(self.eye)
+        eye, target = torch.tensor((self.eye, self.target), dtype=torch.float64)
         centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
-        half_angle = torch.deg2rad(torch.tensor(min(self.fov, 100.0))) / 2
+        half_angle = math.radians(min(self.fov, 100.0)) / 2
         aspect = min(1.0, max(1, width) / max(1, height))
-        distance = radius / max(1e-3, float(half_angle.sin())) / aspect
-        position = centre - forward.double() / forward.norm() * distance
+        distance = radius / max(1e-3, math.sin(half_angle)) / aspect
+        position = centre - (target - eye) / (target - eye).norm() * distance
         return replace(self, eye=tuple(position.tolist()), target=tuple(centre.tolist()))
 
 
@@ -217,9 +217,9 @@ class ViewState:
             object.__setattr__(self, "options", options)
 
     @property
-    def composed(self) -> bool:
-        """Whether planes stand beside the picture, or costs lie over it."""
-        return self.slices is not None or (self.show != "picture" and self.blend < 1)
+    def is_plain(self) -> bool:
+        """Whether it shows the picture alone, without planes beside it and without costs."""
+        return self.slices is None and self.show == "picture"
 
     def settings(self) -> dict[str, Any]:
         """Returns the fields of `RenderOptions` as keyword arguments."""
@@ -262,18 +262,18 @@ class ViewState:
         settings = {**self.settings(), "lighting": None}
         return cost(camera, shader=costed(self.shader), **settings).picture(self.show)
 
-    def with_costs(self, picture: Callable[[], Picture], costs: Callable[[], Picture]) -> Picture:
+    def with_costs(self, picture: Picture, costs: Callable[[], Picture]) -> Picture:
         """Returns the developed picture, or costs in its place or blended over it, as the state
-        says. Calls only what it needs.
+        says. Calls `costs` only if the state shows them; render the picture first, since the costs
+        of a stream are those of the data that it loaded.
         """
         if self.show == "picture":
-            return picture()
+            return picture
         top = costs()
         if self.blend == 1:
             return top
-        below = picture()
-        weight = self.blend * top.alpha.to(below.color)
-        return replace(top, color=torch.lerp(below.color, top.color.to(below.color), weight))
+        weight = self.blend * top.alpha.to(picture.color)
+        return replace(top, color=torch.lerp(picture.color, top.color.to(picture.color), weight))
 
     def to_json(self) -> dict[str, Any]:
         """Returns the state as plain values, ready for JSON."""

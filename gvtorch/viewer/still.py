@@ -5,7 +5,7 @@ session, a step at a time between the frames of pages.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Iterator
 
 from ..base.messages import one_line
 from ..pictures import Picture, Progressive
@@ -14,7 +14,7 @@ from .scene import Scene
 from .slices import Planes, panes
 from .state import Eye, ViewState
 
-Steps = Generator[None, None, Picture]
+Steps = Iterator[Picture | None]  # None until the last step, which yields the picture
 
 
 def still_steps(
@@ -25,8 +25,8 @@ def still_steps(
     size: tuple[int, int],
     unwanted: Callable[[], bool],
 ) -> Steps:
-    """Renders a finished picture: nothing missing, every sample taken. A generator that yields
-    between its steps, so that others get their frames.
+    """Renders a finished picture: nothing missing, every sample taken. Yields None between its
+    steps, so that others get their frames, and the picture at the end.
 
     Args:
         planes: Returns the slices to draw beside it; called last.
@@ -43,27 +43,18 @@ def still_steps(
     camera = eye.camera(width, height, scene.box)
     if scene.engine is not None:  # loads all data
         scene.engine.render(camera, state.shader, progress=stop_if_unwanted, **state.settings())
-        yield
+        yield None
     progressive = Progressive(lambda jittered: scene.frame(jittered, state, stop_if_unwanted))
     picture = progressive.frame(camera)
     while progressive.count < state.develop.samples:
-        yield
+        yield None
         picture = progressive.frame(camera)
     developed = state.develop.develop(picture)
-    shown = state.with_costs(lambda: developed, lambda: scene.cost(camera, state, stop_if_unwanted))
+    shown = state.with_costs(developed, lambda: scene.cost(camera, state, stop_if_unwanted))
     beside = planes()
-    if beside is None or state.slices is None:
-        return shown
-    return beside.composed(shown, state, *size, wait=True).picture
-
-
-def finished_picture(steps: Steps) -> Picture:
-    """Runs all steps and returns the picture, without frames of pages in between."""
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            return end.value
+    if beside is not None and state.slices is not None:
+        shown = beside.composed(shown, state, *size, wait=True).picture
+    yield shown
 
 
 class Stills:
@@ -88,12 +79,12 @@ class Stills:
         """Runs the next step of the first still in the queue; sends it if that was the last."""
         client, steps = self._waiting.popleft()
         try:
-            next(steps)
-        except StopIteration as end:
-            client.send_file("picture.png", image_file(end.value, "PNG"))
+            picture = next(steps)
+            if picture is None:
+                self._waiting.append((client, steps))
+            else:
+                client.send_file("picture.png", image_file(picture, "PNG"))
         except Interrupted:
             pass
         except Exception as error:  # whatever it was, the view goes on
             client.send_message("refused", text=f"still: {one_line(error)}")
-        else:
-            self._waiting.append((client, steps))

@@ -25,7 +25,7 @@ from .server import Server, aiohttp_web
 from .session import Session
 from .state import Eye, ViewState
 
-_ASPECT = (16, 9)  # shape of the picture to which the first camera fits the box
+ASPECT = (16, 9)  # shape of the picture to which the first camera fits the box
 
 
 class Viewer:
@@ -121,11 +121,11 @@ def view(
     aiohttp_web()
     check.integer("view", "port", port, low=0, high=65535)
     session = new_session(what, shader, camera, up=up, state=state, engine=engine, **options)
-    if in_notebook() and wait is None and browser is None:
-        from .notebook import widget
-
-        return widget(session)
     try:
+        if in_notebook() and wait is None and browser is None:
+            from .notebook import widget
+
+            return widget(session)
         server = Server(session, host=host, port=port, token=token, allow=allow)
     except BaseException:
         session.close()
@@ -166,13 +166,12 @@ def new_session(
             component=options.get("component", 0),
             time=scene.time,
         )
-        if isinstance(state, ViewState):
-            chosen = state
-        elif state is not None:
-            chosen = chosen.read(Path(state))
+        if state is not None:
+            check.instance("view", "state", state, ViewState, str, PathLike)
+            chosen = state if isinstance(state, ViewState) else chosen.read(Path(state))
         if chosen.camera is None:
             if camera is None:
-                eye = Eye.first(scene.box, *_ASPECT, up or "+y")
+                eye = Eye.first(scene.box, *ASPECT, up or "+y")
             else:
                 eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)

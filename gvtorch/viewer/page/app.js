@@ -202,9 +202,8 @@ export class App {
   }
 
   load(state) {
-    const { camera, ...rest } = state, before = this.state;
-    this.link.send("change", { state, rest: true });
-    if (camera) this.setCamera(camera);
+    const { camera: _, ...rest } = state, before = this.state;
+    this.link.send("change", { state, rest: true });  // the answer sets the camera
     this.state = merged(this.state, rest);
     this.remember(before, this.state);
     this.refresh();

@@ -1,9 +1,10 @@
 // The clip: its boxes and planes in the world, and their handles in the picture.
 import { axes, halfHeightAt, projected } from "./camera.js";
-import { COLORS, corner, EDGES, largestSide } from "./picture.js";
+import { centreOf, COLORS, corner, EDGES, largestSide } from "./picture.js";
 import { add, clamp, cross, dot, sub, times, unit } from "./vectors.js";
 
 const WARM = "242,181,107";
+const NO_CLIP = { kind: "Clip", planes: [], boxes: [], without: [], frame: "box" };
 const ARROW = 0.16;  // length, in largest sides of the box
 
 export class ClipEditor {
@@ -24,8 +25,7 @@ export class ClipEditor {
   }
 
   get middle() {
-    const { box } = this.app;
-    return [0, 1, 2].map((axis) => (box[0][axis] + box[1][axis]) / 2);
+    return centreOf(this.app.box);
   }
 
   toBox(position) {
@@ -53,14 +53,14 @@ export class ClipEditor {
   }
 
   setCrop(on) {
-    const clip = this.clip ?? { kind: "Clip", planes: [], boxes: [], without: [], frame: "box" };
+    const clip = this.clip ?? NO_CLIP;
     const corners = this.app.box.map((point) => (clip.frame === "world" ? point : this.toBox(point)));
     this.setClip({ ...clip, boxes: on ? [corners] : [] }, true);
   }
 
   addPlane() {
     const { app } = this, { forward } = axes(app.camera), { target } = app.camera;
-    const clip = this.clip ?? { kind: "Clip", frame: "box", planes: [], boxes: [], without: [] };
+    const clip = this.clip ?? NO_CLIP;
     const point = clip.frame === "world" ? target : this.toBox(target);
     this.setClip({ ...clip, planes: [...clip.planes, [...forward, -dot(forward, point)]] }, true);
   }
@@ -108,7 +108,7 @@ export class ClipEditor {
   }
 
   faces(context, crop, handles) {
-    const centre = [0, 1, 2].map((axis) => (crop[0][axis] + crop[1][axis]) / 2), stepSize = this.side * 0.01;
+    const centre = centreOf(crop), stepSize = this.side * 0.01;
     for (const axis of [0, 1, 2]) {
       for (const side of [0, 1]) {
         const anchor = [...centre], displacement = [0, 0, 0];
@@ -152,7 +152,10 @@ export class ClipEditor {
     context.moveTo(...projection.at);
     context.lineTo(...view.pixel(end));
     context.stroke();
-    const move = (amount) => this.putPlane(n, normalOf(this.plane(n)), this.plane(n).offset + amount);
+    const move = (amount) => {
+      const current = this.plane(n);
+      this.putPlane(n, current.normal, current.offset + amount);
+    };
     handles.push({ kind: "plane", n, ...projection, drag: (dx, dy) => this.dragAlong(projection.step, dx, dy, size, move) });
     handles.push({ kind: "tilt", n, at: view.pixel(end), drag: (dx, dy) => this.tilt(n, dx, dy) });
     view.dot(context, projection.at, `rgb(${WARM})`);
@@ -185,5 +188,3 @@ export class ClipEditor {
     return points.sort((point, otherPoint) => angle(point) - angle(otherPoint));
   }
 }
-
-const normalOf = ({ normal }) => normal;

@@ -2,7 +2,9 @@
 import { el } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
-const spaced = (name) => name.replaceAll("_", " ");
+/** The name of a field or a class in words: "cap_light" is "cap light", "PointLight" is "Point light". */
+export const spaced = (name) => name.replaceAll("_", " ").replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);
+
 const AXIS_NAMES = ["x", "y", "z"];
 
 export class Controls {

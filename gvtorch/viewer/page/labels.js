@@ -5,9 +5,8 @@ import { hex, linear } from "./vectors.js";
 const MAX_ROWS = 60;  // shown at a time
 
 export class LabelTable {
-  constructor(app, controls) {
+  constructor(app) {
     this.app = app;
-    this.controls = controls;
     this.search = "";
     this.filter = el("input", { type: "text", placeholder: "find a label", oninput: () => { this.search = this.filter.value.trim(); this.fill(); } });
     this.body = el("div.gv-labels");

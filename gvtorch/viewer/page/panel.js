@@ -1,11 +1,9 @@
 // The panel: sections of controls for every part of the state.
-import { Controls } from "./controls.js";
+import { Controls, spaced } from "./controls.js";
 import { axes } from "./camera.js";
 import { el } from "./dom.js";
 import { LabelTable } from "./labels.js";
 import { TransferEditor, domain } from "./transfer.js";
-
-const HIDDEN = ["transfer", "kind", "camera", "looks"];
 
 export class Panel {
   constructor(app) {
@@ -14,7 +12,7 @@ export class Panel {
     this.controls = new Controls(app.schema, (kind, name) => this.newObject(kind, name), () => ({ ...app.unfit, ...this.unfit }));
     this.unfit = unfitColours(app.widths);
     this.editor = new TransferEditor((f, rest) => app.changeTransfer(f, rest));
-    this.labels = new LabelTable(app, this.controls);
+    this.labels = new LabelTable(app);
     this.body = el("div.gv-sections");
     this.element = el("aside.gv-panel", {}, this.body);
     this.outdated = false;  // whether the rows wait to be rebuilt
@@ -131,7 +129,7 @@ export class Panel {
     const offered = kinds.filter((kind) => app.offers(kind) || kind === shader.kind);
     const select = el("select", { onchange: () => change(this.newObject(offered[select.selectedIndex], "shader"), true) }, ...offered.map((kind) => el("option", {}, spaced(kind))));
     select.selectedIndex = offered.indexOf(shader.kind);
-    const rows = this.controls.fields(shader, change, { without: [...HIDDEN, ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "visible", "color_channel", "color_component"])] });
+    const rows = this.controls.fields(shader, change, { without: ["transfer", "looks", ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "visible", "color_channel", "color_component"])] });
     return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), select), ...rows, this.surface()];
   }
 
@@ -202,15 +200,13 @@ export class Panel {
     if (!app.engine) return [];
     const fields = app.schema.EngineOptions.fields;
     return Object.entries(app.engine).map(([name, value]) => {
-      const field = name.endsWith("pool") ? { type: "text" } : fields[name];
-      return this.controls.row(name, { ...field, text: fields[name].text }, value, (newValue, rest) => {
+      const field = name.endsWith("pool") ? { type: "text", text: fields[name].text } : fields[name];
+      return this.controls.row(name, field, value, (newValue, rest) => {
         if (rest) app.setValue("resize", app.engine, name, newValue, (sentValue) => ({ engine: { [name]: sentValue } }));
       });
     });
   }
 }
-
-const spaced = (kind) => kind.replace(/([a-z])([A-Z])/g, (_, a, b) => `${a} ${b.toLowerCase()}`);
 
 /** The channel that colours a surface: the present one if it fits, else the last that does; null: one fixed colour. */
 function colorChannel({ color, color_channel }, widths) {

@@ -4,10 +4,6 @@ import { el } from "./dom.js";
 import { short } from "./vectors.js";
 
 export const COLORS = ["#ff7a6b", "#8fd460", "#6fb1ff"];  // x, y, z
-const UNITS = {
-  meter: "m", decimeter: "dm", centimeter: "cm", millimeter: "mm", micrometer: "µm", nanometer: "nm",
-  angstrom: "Å", picometer: "pm", kilometer: "km", inch: "in", foot: "ft",
-};
 export const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const HIT_RADIUS = 12;  // pixels within which a handle is hit
 
@@ -84,10 +80,6 @@ export class PictureView {
   get pictureArea() {
     const [left, top, width, height] = this.pictureRect.map((number) => number / this.ratio);
     return { left, top, width, height };
-  }
-
-  get unit() {
-    return UNITS[this.app.unit] ?? "";
   }
 
   /** Canvas pixels of a point that is given in half heights from the picture's middle. */
@@ -200,7 +192,7 @@ export class PictureView {
     const size = [5, 2, 1].map((n) => n * power).find((n) => n <= maxSize) ?? power;
     const span = size / pixelSize, y = top + height - (this.app.time ? 62 : 26) * this.ratio;
     const middle = left + width / 2, [a, b] = [middle - span / 2, middle + span / 2];
-    const text = `${short(size)} ${this.unit}`.trim();
+    const text = `${short(size)} ${this.app.unit}`.trim();
     const draw = () => {
       context.beginPath();
       context.moveTo(a, y - 4 * this.ratio);
@@ -218,6 +210,9 @@ export class PictureView {
     this.label(context, text, middle, y - 5 * this.ratio, "center");
   }
 }
+
+/** The centre of a box. */
+export const centreOf = ([low, high]) => low.map((start, axis) => (start + high[axis]) / 2);
 
 /** The largest side of a box. */
 export const largestSide = (box) => Math.max(...[0, 1, 2].map((axis) => box[1][axis] - box[0][axis]));

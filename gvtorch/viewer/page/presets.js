@@ -38,7 +38,7 @@ export class Presets {
     const ownNames = Object.keys(ownFunctions()), groups = [["gvtorch", this.builtIn]];
     if (ownNames.length) groups.push(["mine", ownNames]);
     if (this.file) groups.push([this.file.name, this.file.names]);
-    const handlers = { gvtorch: (name) => this.requestPreset(name), mine: (name) => this.app.changeTransfer(ownFunctions()[name], true) };
+    const handlers = { gvtorch: (name) => this.app.link.send("preset", { name, ...this.span() }), mine: (name) => this.app.changeTransfer(ownFunctions()[name], true) };
     const select = el("select", { title: "Colours by name; colour maps keep the opacity", onchange: () => {
       const chosen = select.selectedOptions[0], { group } = chosen.dataset;
       if (!group) return;
@@ -60,14 +60,9 @@ export class Presets {
     };
   }
 
-  requestPreset(name) {
-    this.app.link.send("preset", name.startsWith("ct-") ? { name } : { name, ...this.span() });
-  }
-
-  receive({ name, function: preset, lost: notes }) {
+  receive({ name, function: preset, colors_only: isMap, lost: notes }) {
     const { app } = this, current = app.transfer();
-    const isMap = this.builtIn.includes(name) && preset.color.length > 100 && current;  // a colour map has no opacity of its own
-    app.changeTransfer(isMap ? { ...current, color: preset.color } : preset, true);
+    app.changeTransfer(isMap && current ? { ...current, color: preset.color } : preset, true);
     app.panel.editor.setHistogram(app.panel.editor.histogram);
     app.notify([name, ...(notes ?? [])].join("; "));
   }

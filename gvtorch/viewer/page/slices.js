@@ -1,5 +1,6 @@
 // Three planes beside the picture: their layout, what is drawn over them, and how the pointer moves them.
-import { COLORS } from "./picture.js";
+import { centreOf, COLORS } from "./picture.js";
+import { clamp } from "./vectors.js";
 
 const AXES = ["x", "y", "z"];
 const REST_MS = 200;  // milliseconds after which a wheel is at rest
@@ -28,8 +29,7 @@ export class SlicesView {
   }
 
   show(on) {
-    const middle = [0, 1, 2].map((axis) => (this.app.box[0][axis] + this.app.box[1][axis]) / 2);
-    this.app.change({ slices: on ? { kind: "Slices", position: middle } : null });
+    this.app.change({ slices: on ? { kind: "Slices", position: centreOf(this.app.box) } : null });
   }
 
   moveTo(position, rest) {
@@ -39,7 +39,7 @@ export class SlicesView {
   /** Moves the planes to the point that a plane shows at a position in CSS pixels. */
   pick(axis, x, y) {
     const { image: [left, top, width, height], columns, rows } = this.layout[axis];
-    const fraction = (pixel, start, size) => Math.min(1, Math.max(0, (pixel * this.view.ratio - start) / size));
+    const fraction = (pixel, start, size) => clamp((pixel * this.view.ratio - start) / size, 0, 1);
     const position = [...this.position];
     const setCoordinate = ([name, first, last], t) => { position[AXES.indexOf(name)] = first + t * (last - first); };
     setCoordinate(columns, fraction(x, left, width));
@@ -51,7 +51,7 @@ export class SlicesView {
   wheel(axis, amount) {
     const position = [...this.position], { step } = this.layout[axis], index = AXES.indexOf(axis), { box } = this.app;
     const moved = position[index] - Math.sign(amount) * step;
-    position[index] = Math.min(box[1][index] - step / 2, Math.max(box[0][index] + step / 2, moved));
+    position[index] = clamp(moved, box[0][index] + step / 2, box[1][index] - step / 2);
     this.moveTo(position, false);
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.app.finishEdit(), REST_MS);
@@ -81,8 +81,7 @@ export class SlicesView {
       context.lineWidth = ratio;
       context.strokeRect(pane[0] + 0.5, pane[1] + 0.5, pane[2] - 1, pane[3] - 1);
       const number = Number(position[AXES.indexOf(axis)].toPrecision(5));
-      const unit = this.view.unit ? ` ${this.view.unit}` : "";
-      this.view.label(context, `${name}, ${axis} = ${number}${unit}`, pane[0] + 10 * ratio, pane[1] + pane[3] - 10 * ratio, "left");
+      this.view.label(context, `${name}, ${axis} = ${number} ${this.app.unit}`.trim(), pane[0] + 10 * ratio, pane[1] + pane[3] - 10 * ratio, "left");
     }
   }
 }

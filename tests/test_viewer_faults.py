@@ -1,0 +1,317 @@
+"""What goes wrong in a view and must leave it consistent: states that are refused, scenes that
+can't be made again, views that close early.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from dataclasses import dataclass
+from functools import partial
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+import torch
+from helpers.pictures import GRAY
+from helpers.viewer import FUNCTION, TIMEOUT, Grown, Page, bright_ball, turned_camera
+
+import gvtorch as gv
+from gvtorch.shaders import Labels
+from gvtorch.viewer import view
+from gvtorch.viewer.scene import Scene
+from gvtorch.viewer.server import Server
+from gvtorch.viewer.state import Eye, ViewState
+from gvtorch.viewer.view import new_session
+
+pytestmark = pytest.mark.backend("cpp")
+CLOCK_BOX = ((-10, -10, -10), (10, 10, 10))
+
+
+@pytest.mark.parametrize(
+    "shader",
+    [Labels(visible=list(range(5000))), Labels(colors={n: (1.0, 0.0, 0.0) for n in range(5000)})],
+    ids=["list", "mapping"],
+)
+def test_a_state_with_more_items_than_json_may_hold_comes_back(shader):
+    state = ViewState(shader=shader)
+    content = state.to_json()
+    changed = state.changed(content)
+    assert changed.to_json() == content
+    assert changed.shader.visible == shader.visible and changed.shader.colors == shader.colors
+
+
+def test_a_message_names_the_wrong_label_once():
+    state = ViewState(shader=Labels())
+    content = {"kind": "Labels", "colors": {"5": [1, 2, 3, 4, 5]}}
+    with pytest.raises(ValueError) as error:
+        state.changed({"shader": content})
+    assert str(error.value).count("state.shader.colors") <= 1, error.value
+
+
+def test_an_eye_far_from_the_origin_is_fitted_along_its_own_direction():
+    box = torch.tensor([[0, 0, 0], [4, 4, 4]], dtype=torch.float64) + 1e8
+    eye = Eye(eye=(1e8 + 1.5, 1e8, 1e8 + 2), target=(1e8, 1e8, 1e8)).fitted(box, 64, 64)
+    away = np.subtract(eye.eye, eye.target)
+    assert np.allclose(away / np.linalg.norm(away), [0.6, 0, 0.8], atol=1e-6)
+    assert np.allclose(eye.target, 1e8 + 2)
+
+
+def test_an_eye_too_near_its_target_is_refused_before_it_is_drawn():
+    with pytest.raises(ValueError, match="eye and target must differ"):
+        Eye(eye=(0, 0, 1e-200), target=(0, 0, 0))
+
+
+def test_an_eye_has_the_fields_of_view_that_cameras_have():
+    for fov in (0, 1e-13, 180, float("nan")):
+        with pytest.raises(ValueError, match="Eye: fov must be finite and >= 1e-12 and <= 179"):
+            Eye(eye=(0, 0, 1), target=(0, 0, 0), fov=fov)
+    assert Eye(eye=(0, 0, 1), target=(0, 0, 0), fov=1e-12).camera(8, 8, torch.eye(3)[:2])
+
+
+def test_a_scene_that_can_not_be_made_again_stays_as_it_was():
+    """Of the new time point no producer can be made."""
+    first, second = bright_ball(), bright_ball()
+
+    def remake(data):
+        if data is second:
+            raise OSError("the disk is gone")
+        return gv.VolumeProducer(data)
+
+    engine = gv.Engine(remake(first))
+    scene = Scene("ball", engine, data=first, remake=remake, times=2)
+    with pytest.raises(OSError, match="the disk is gone"):
+        scene.show_time(1.0, second)
+    assert scene.data is first and scene.time == 0
+    camera = gv.Camera.orbit(width=8, height=8).placed(scene.box)
+    assert scene.frame(camera, ViewState(shader=FUNCTION)).color.shape == (8, 8, 3)
+    scene.close()
+
+
+def test_a_time_point_that_can_not_be_shown_is_told_and_the_state_goes_back():
+    session = new_session(bright_ball(), FUNCTION)
+    try:
+        page = Page(session)
+        page.final()
+
+        def reopen(time: int):
+            return gv.Volume(torch.zeros(8, 8, 8, 3))  # the shader shows one of two channels
+
+        def prepare() -> None:
+            scene, remake = session.scene, session.scene.remake
+
+            def one_component(data):
+                if data.width > 1:
+                    raise ValueError("there is another width")
+                return remake(data)
+
+            scene.times, scene.reopen, scene.remake = 3, reopen, one_component
+
+        session.ask(prepare)
+        page.send("change", state={"time": 1})
+        assert page.next("error", 0)["text"] == "time 1: there is another width"
+        page.until(lambda: page.of_type("state")[-1]["state"]["time"] == 0)
+        page.moved(turned_camera(page.camera, 0.3))
+    finally:
+        session.close()
+
+
+@dataclass
+class Speed:
+    """What a growing ball is made of."""
+
+    size: int = 32
+
+
+def growing(settings: Speed) -> gv.Producer:
+    return gv.FieldProducer(Grown(), settings.size, box=CLOCK_BOX)
+
+
+def test_a_scene_that_is_made_again_keeps_the_time_of_its_clocks():
+    session = new_session(growing, gv.TransferFunction([(0.4, 0), (0.6, 1)]))
+    try:
+        page = Page(session)
+        page.final()
+        page.send("change", state={"time": 8.0})
+        page.until(lambda: page.pictures[-1][0]["time"] == 8 and page.pictures[-1][0]["final"])
+        page.send("set", name="size", value=16)
+        page.next("parameters", 0)
+        assert session.ask(lambda: [producer.time for producer in session.scene.producers]) == [8.0]
+    finally:
+        session.close()
+
+
+def test_a_state_that_can_not_be_drawn_gives_back_the_time_too():
+    producer = growing(Speed())
+    session = new_session(producer, gv.TransferFunction([(0.4, 0), (0.6, 1)]))
+    try:
+        page = Page(session)
+        page.final()
+        broken = {"kind": "Features", "channel": "none"}
+        broken["transfer"] = page.of_type("welcome")[0]["state"]["shader"]
+        page.send("change", state={"time": 8.0, "shader": broken})
+        assert "unknown channel 'none'" in page.next("error", 0)["text"]
+        page.until(lambda: page.of_type("state")[-1]["state"]["time"] == 3.0)
+        assert session.ask(lambda: (session.scene.time, producer.time)) == (3.0, 3.0)
+    finally:
+        session.close()
+
+
+def test_a_refused_change_leaves_the_camera_where_it_was(session):
+    page = Page(session)
+    page.final()
+    camera = turned_camera(page.camera, 0.5)
+    page.send("change", state={"time": 5.0, "camera": camera})
+    assert "nothing changes with time" in page.next("refused", 0)["text"]
+    assert page.next("camera", 0)["camera"]["eye"] == page.camera["eye"]
+    assert session.ask(lambda: list(page.client.eye.eye)) == page.camera["eye"]
+
+
+def test_costs_of_a_stream_are_shown_once_nothing_is_missing():
+    """Frames go on until all data are loaded, although the picture itself is not shown."""
+    options = {"load_budget": 4, "time_budget": None, "brick_size": 8}
+    session = new_session(bright_ball(64), FUNCTION, engine=options)
+    try:
+        page = Page(session, 128, 96)
+        page.send("change", state={"show": "lod"})
+        page.until(lambda: page.pictures and page.pictures[-1][0]["final"])
+        camera = session.state.camera.camera(64, 48, session.scene.box)
+        frame = session.ask(lambda: session.scene.frame(camera, session.state))
+        assert frame.stats.misses == 0
+    finally:
+        session.close()
+
+
+def test_a_question_to_a_view_that_closes_is_answered_at_once(session):
+    begun, go = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        begun.set()
+        assert go.wait(TIMEOUT)
+
+    session.post(wait)
+    assert begun.wait(TIMEOUT)
+    errors = []
+
+    def ask() -> None:
+        try:
+            session.ask(lambda: None, timeout=5.0)
+        except Exception as error:
+            errors.append(error)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    while not session._tasks:
+        pass
+    closing = threading.Thread(target=session.close)
+    closing.start()
+    while not session._closed:
+        pass
+    go.set()
+    closing.join(TIMEOUT)
+    asking.join(TIMEOUT)
+    assert [type(error) for error in errors] == [RuntimeError]
+
+
+def test_a_surface_ends_with_its_view(session, monkeypatch):
+    from gvtorch.viewer import export
+
+    begun, go, stopped = threading.Event(), threading.Event(), threading.Event()
+
+    def endless(*_arguments, progress, **_options):
+        begun.set()
+        assert go.wait(TIMEOUT)
+        try:
+            progress("surface", 1, 2)
+        except BaseException:
+            stopped.set()
+            raise
+
+    monkeypatch.setattr(export, "export_surface", endless)
+    page = Page(session)
+    page.send("surface", value=100.0)
+    assert begun.wait(TIMEOUT)
+    session.close()
+    go.set()
+    assert stopped.wait(TIMEOUT)
+
+
+def test_a_still_that_can_not_be_written_is_told_and_the_view_goes_on(session, monkeypatch):
+    from gvtorch.viewer import still
+
+    def full(*_arguments, **_options):
+        raise MemoryError("no memory for the PNG")
+
+    monkeypatch.setattr(still, "image_file", full)
+    page = Page(session)
+    page.final()
+    page.send("still", width=32, height=32)
+    assert page.next("refused", 0)["text"] == "still: no memory for the PNG"
+    page.moved(turned_camera(page.camera, 0.3))
+
+
+def test_figures_that_can_not_be_made_are_told_and_the_view_goes_on(session, monkeypatch):
+    page = Page(session)
+    page.final()
+    monkeypatch.setattr(
+        session, "_frame_figures", lambda picture: {}["no such figure"], raising=True
+    )
+    session.ask(lambda: setattr(page.client, "monitor", True))
+    session._figures_time = 0.0
+    page.send("move", camera=turned_camera(page.camera, 0.3), moving=False)
+    assert "no such figure" in page.next("error", 0)["text"]
+    session.ask(lambda: setattr(page.client, "monitor", False))
+    page.moved(turned_camera(page.camera, 0.6))
+
+
+def test_a_widget_that_can_not_be_made_closes_its_view(monkeypatch):
+    from gvtorch.viewer import notebook
+
+    def missing(session):
+        raise ImportError("view in a notebook needs anywidget")
+
+    monkeypatch.setattr(sys.modules["gvtorch.viewer.view"], "in_notebook", lambda: True)
+    monkeypatch.setattr(notebook, "widget", missing)
+    with pytest.raises(ImportError, match="anywidget"):
+        view(bright_ball(16))
+    running = [thread for thread in threading.enumerate() if thread.name == "gvtorch view"]
+    assert not running
+
+
+@dataclass
+class Needed:
+    """A dataclass without a default."""
+
+    radius: float
+
+
+def needs(settings: Needed) -> gv.Producer:
+    return growing(Speed())
+
+
+def test_functions_of_something_else_are_refused_in_a_line():
+    for function in (needs, partial(growing, Speed()), len, lambda: None):
+        with pytest.raises(ValueError, match="view: ") as error:
+            new_session(function)
+        assert "\n" not in str(error.value)
+
+
+def test_names_of_hosts_are_compared_without_case_and_tokens_survive_the_address(session):
+    server = Server(session, allow=["Render.Box"], token="a+b &c=é")
+    try:
+        assert server.is_allowed("render.box:80") and not server.is_allowed("other.box")
+        assert parse_qs(urlsplit(server.url).query)["token"] == [server.token]
+        assert " " not in server.url
+    finally:
+        server.close()
+
+
+@pytest.mark.parametrize("options", [{"token": 5}, {"allow": "render.box"}, {"host": 5}])
+def test_wrong_arguments_of_a_server_are_refused(session, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        Server(session, **options)
+
+
+def test_the_state_of_a_view_is_a_file_or_a_state():
+    with pytest.raises(ValueError, match="view: state must be a"):
+        new_session(bright_ball(8), GRAY, state=5)
