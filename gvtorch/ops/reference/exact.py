@@ -15,7 +15,6 @@ TINY = 1.1754944e-38  # smallest normal float32: a transmittance not above it co
 
 def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
     """Clamps values; NaN becomes the lower bound."""
-    low, high = torch.as_tensor(low).to(value), torch.as_tensor(high).to(value)
     raised = torch.where(value > low, value, low)
     return torch.where(raised < high, raised, high)
 

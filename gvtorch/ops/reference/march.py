@@ -161,11 +161,12 @@ class ShadeSum:
         transmittance = 1 - alpha
         clear_after = self.clear * transmittance
         hit = mask & (clear_after < self.hit_clear) & (self.clear >= self.hit_clear)
-        opaque = ~(transmittance > TINY)
-        fraction = log2_exact(torch.where(hit, self.hit_clear / self.clear, 1.0))
-        fraction = fraction / log2_exact(torch.where(hit & ~opaque, transmittance, 0.5))
-        fraction = torch.where(opaque, 0.0, clamp(fraction, 0, 1))
-        self.depth = torch.where(hit, piece.start + fraction * piece.length, self.depth)
+        if hit.any():
+            opaque = ~(transmittance > TINY)
+            fraction = log2_exact(torch.where(hit, self.hit_clear / self.clear, 1.0))
+            fraction = fraction / log2_exact(torch.where(hit & ~opaque, transmittance, 0.5))
+            fraction = torch.where(opaque, 0.0, clamp(fraction, 0, 1))
+            self.depth = torch.where(hit, piece.start + fraction * piece.length, self.depth)
         self.clear = torch.where(mask, clear_after, self.clear)
 
 

@@ -155,6 +155,7 @@ class Intervals:
         self.level = torch.zeros_like(first, dtype=torch.int64)
         self.base = first  # (r,) where the level was chosen
         self.count = torch.zeros_like(first)  # intervals since base
+        self.length = self.length_l[self.level]
         self._choose_level(torch.ones_like(first, dtype=torch.bool))
 
     @property
@@ -166,28 +167,8 @@ class Intervals:
         """Continues from an earlier `state`."""
         self.base, self.count, level = state_r3.unbind(1)
         self.level = clamp(level, 0, len(self.length_l) - 1).to(torch.int64)
-        self.start = self.base + self.count * self.length
-
-    @property
-    def length(self) -> Tensor:
-        """(r,) length of whole intervals."""
-        return self.length_l[self.level]
-
-    @property
-    def whole_end(self) -> Tensor:
-        """(r,) end of the whole interval, where the next one starts."""
-        return self.base + (self.count + 1) * self.length
-
-    @property
-    def cut(self) -> Tensor:
-        """(r,) bool: the interval is the last one, cut at the far side."""
-        return ~(self.whole_end <= self.beam.last)
-
-    @property
-    def middle(self) -> Tensor:
-        """(r,) where values are sampled."""
-        cut = self.start + (self.beam.last - self.start) * 0.5
-        return torch.where(self.cut, cut, self.base + (self.count + 0.5) * self.length)
+        self.start = self.base + self.count * self.length_l[self.level]
+        self._find_middle()
 
     def inside(self) -> Tensor:
         """Returns (r,) bool: the interval starts before the far side."""
@@ -195,9 +176,8 @@ class Intervals:
 
     def next(self, mask: Tensor) -> None:
         """Moves to the next interval where `mask` (r,) is true."""
-        start = self.whole_end
         self.count = torch.where(mask, self.count + 1, self.count)
-        self.start = torch.where(mask, start, self.start)
+        self.start = torch.where(mask, self.whole_end, self.start)
         self._choose_level(mask)
 
     def _choose_level(self, mask: Tensor) -> None:
@@ -216,3 +196,12 @@ class Intervals:
         self.base = torch.where(changes, self.start, self.base)
         self.count = torch.where(changes, 0.0, self.count)
         self.level = torch.where(changes, level, self.level)
+        self._find_middle()
+
+    def _find_middle(self) -> None:
+        self.length = self.length_l[self.level]  # (r,) of whole intervals
+        self.whole_end = self.base + (self.count + 1) * self.length  # (r,) where the next starts
+        self.cut = ~(self.whole_end <= self.beam.last)  # (r,) bool: cut at the far side
+        cut_middle = self.start + (self.beam.last - self.start) * 0.5
+        middle = self.base + (self.count + 0.5) * self.length
+        self.middle = torch.where(self.cut, cut_middle, middle)  # (r,) where values are sampled

@@ -108,7 +108,7 @@ class Tree:
         descent = Descent(node, depth, absent, hides(node), absent, depth, absent, depth)
         active = torch.ones_like(node, dtype=torch.bool)
         while True:
-            args.stamp_t[torch.unique(descent.node[active] // self.per_tile)] = args.frame_1[0]
+            args.stamp_t[descent.node[active] // self.per_tile] = args.frame_1[0]
             has_data = active & (self.brick_n[descent.node] != ABSENT)
             descent.fine = torch.where(has_data, descent.node, descent.fine)
             descent.fine_depth = torch.where(has_data, descent.depth, descent.fine_depth)
@@ -160,7 +160,7 @@ class Tree:
     def stamp(self, brick: Tensor) -> None:
         """Stamps brick slots as used in this frame; words below 0 are no slots."""
         args = self.arguments
-        args.stamp_b[torch.unique(brick[brick >= 0])] = args.frame_1[0]
+        args.stamp_b[brick[brick >= 0]] = args.frame_1[0]
 
     def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
         """Joins requests into the request words: kinds by OR, priorities by maximum. A priority is
