@@ -22,7 +22,8 @@ NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/de
 # system's (Debian: libegl1, libgl1-mesa-dri; chromium). With CI set, both must be there.
 REQUIRE := reference,cpp,io$(if $(CI)$(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
 REQUIRE := $(REQUIRE)$(if $(CI)$(shell command -v chromium chromium-browser google-chrome),$(COMMA)browser)
-# Of 16,000 files of Python, those that are imported are compiled then; all at once would take a minute.
+# Of 16,000 files of Python, those that are imported are compiled then; all at once would take a minute. The pip that
+# Python brings may be years old and take a minute longer to find what fits together.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint .ci/constraints.txt
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)
@@ -100,6 +101,7 @@ clean:
 $(VENV)/torch: pyproject.toml .ci/constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "gvtorch needs Python 3.11 or newer, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
+	$(PIP) --upgrade pip
 	$(PIP) setuptools wheel "$(TORCH)"
 	@touch $@
 

@@ -342,9 +342,13 @@ class _Painter:
         low, high = self.table.domain_2
         rows = self.table.table_lm4[0]
         row_position = (values - low) * ((len(rows) - 1) / (high - low))
-        row, fraction = row_and_fraction(row_position, len(rows))
-        rgba = [
-            torch.lerp(column[row], column[row + 1], fraction) for column in rows.T.contiguous()
+        row, fraction = row_and_fraction(row_position.flatten(), len(rows))
+        next_row = row + 1
+        rgba = [  # `index_select` takes a third of the time of `column[row]`
+            torch.lerp(
+                column.index_select(0, row), column.index_select(0, next_row), fraction
+            ).view_as(values)
+            for column in rows.T.contiguous()
         ]
         color = [channel * rgba[3] for channel in rgba[:3]]
         if self.voxel_sizes is not None:
