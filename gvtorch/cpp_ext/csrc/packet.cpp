@@ -10,16 +10,18 @@
 namespace gvtorch::GV_NAMESPACE {
 
 void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
-  // In pools of 2 GiB and more, whose voxels are loaded one by one, knowing the dtype gains nothing.
-  const bool is_small = brick_bytes(args.voxel, args.side, args.voxel_width) * args.bricks <= INT32_MAX;
-  if (args.shader != kPlainShader || !is_small) {
+  if (args.shader != kPlainShader) {
     return with_shader<float>(args.shader, [&](auto type) {
       using Type = decltype(type);
       if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
     });
   }
-  with_voxel(args.voxel,
-             [&](auto voxel) { trace_packets<Plain<float>, TypedValues<decltype(voxel)>>(args, begin, end); });
+  const bool far_offsets = brick_bytes(args.voxel, args.side, args.voxel_width) * args.bricks > INT32_MAX;
+  with_voxel(args.voxel, [&](auto voxel) {
+    using Voxel = decltype(voxel);
+    if (far_offsets) return trace_packets<Plain<float>, TypedValues<Voxel, true>>(args, begin, end);
+    return trace_packets<Plain<float>, TypedValues<Voxel, false>>(args, begin, end);
+  });
 }
 
 template <class T>

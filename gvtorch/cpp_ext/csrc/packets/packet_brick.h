@@ -194,18 +194,18 @@ struct PacketChannel : ChannelView {
   }
 };
 
-// The shader's values: of a dtype known to the compiler, in a pool of less than 2 GiB, or of one known only at run
-// time. `slot_bytes` is what a slot is multiplied by to give PacketBrick::brick.
-template <class KnownVoxel>
+// The shader's values: of a dtype known to the compiler, or only at run time. `slot_bytes` is what a slot is multiplied
+// by to give PacketBrick::brick.
+template <class KnownVoxel, bool kLongOffsets>
 struct TypedValues {
   using Voxel = KnownVoxel;
   const PacketPool pool;
 
   TypedValues(const ChannelView& channel, int32_t side, int32_t component, int64_t)
       : pool(channel.bricks_bzyxc, channel.type, side, channel.width, component) {}
-  int32_t slot_bytes() const { return static_cast<int32_t>(pool.stride); }
+  int32_t slot_bytes() const { return kLongOffsets ? 1 : static_cast<int32_t>(pool.stride); }
   GV_HD Floats read(Ints brick, const Vec3<Floats>& position) const {
-    return trilinear<Voxel, false>(pool, brick, position);
+    return trilinear<Voxel, kLongOffsets>(pool, brick, position);
   }
 };
 struct AnyValues {

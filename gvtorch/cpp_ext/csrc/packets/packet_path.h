@@ -97,10 +97,12 @@ struct PacketPath {
     const Levels<float>& levels = walk.levels;
     const Floats middle = intervals.middle();
     const Floats cone = intervals.cone(middle);
+    Floats wanted_voxel = pick(levels.voxel, wanted);
     for (;;) {
-      const Mask finer = mask & (wanted < tree.max_depth) & (pick(levels.voxel, wanted) > cone);
+      const Mask finer = mask & (wanted < tree.max_depth) & (wanted_voxel > cone);
       if (!any(finer)) break;
       wanted = wanted - finer;
+      wanted_voxel = pick(levels.voxel, wanted);
     }
     Floats voxel_above;
     for (;;) {
@@ -108,9 +110,9 @@ struct PacketPath {
       const Mask coarser = mask & (wanted > 0) & ~(voxel_above > cone);
       if (!any(coarser)) break;
       wanted = wanted + coarser;
+      wanted_voxel = coarser ? voxel_above : wanted_voxel;
     }
     voxel_above = wanted > 0 ? voxel_above : Floats{} + INFINITY;
-    const Floats wanted_voxel = pick(levels.voxel, wanted);
     const Mask reached = wanted_voxel <= cone;
     const Mask blend = reached & (wanted > 0);
     extent.cone_low = mask ? (reached ? wanted_voxel : Floats{} - INFINITY) : extent.cone_low;
@@ -121,7 +123,8 @@ struct PacketPath {
     Ints depth, node, brick, tile;
     descend(mask, middle, hidden_from, depth, node, brick, tile);
     const Mask hidden_nodes = node < 0;
-    const Floats exit = ray.exit_distance([&](int axis, Mask upper) { return face(mask, axis, depth, upper); });
+    const Floats size = pick(levels.size, depth);
+    const Floats exit = ray.exit_distance([&](int axis, Mask upper) { return face(mask, axis, depth, size, upper); });
     extent.exit = mask ? exit : extent.exit;
 
     // The nodes whose bricks are read.
@@ -244,7 +247,7 @@ struct PacketPath {
 
   // `move_to` moves lanes to their positions at distance t; it returns the deepest level, at most `deepest`, at which a
   // lane is in the same node as before. `child` and `face` are those of Digits and BitDigits: which child of the node
-  // above a lane is in, and the offset of a face of its node from its ray's origin.
+  // above a lane is in, and the offset of a face of its node, which is `size` wide, from its ray's origin.
   GV_HD Ints move_to(Mask mask, Floats t, Ints deepest) {
     if (walk.rays.deep) return deep_lanes.move_to(mask, ray.direction, t, deepest);
     const TreeView& tree = walk.tree;
@@ -270,10 +273,10 @@ struct PacketPath {
                z = (cell.z >> shift) & digit_mask;
     return (z << (2 * bits)) | (y << bits) | x;
   }
-  GV_HD Floats face(Mask mask, int axis, Ints level, Mask upper) const {
+  GV_HD Floats face(Mask mask, int axis, Ints level, Floats size, Mask upper) const {
     if (walk.rays.deep) return deep_lanes.face(mask, axis, level, upper);
     const Ints shift = walk.tree.digit_bits * (walk.tree.max_depth - level);
-    return to_floats((cell[axis] >> shift) - upper) * pick(walk.levels.size, level) - ray.origin[axis];
+    return to_floats((cell[axis] >> shift) - upper) * size - ray.origin[axis];
   }
 
   GV_HD void stamp(int32_t* stamps, Mask mask, Ints index) const {
@@ -289,10 +292,10 @@ struct PacketPath {
 
   GV_HD void set_brick(Mask mask, Ints holder_depth, Ints brick, PacketBrick& to) {
     const Mask stored = brick >= 0;
-    const Floats scale = pick(walk.levels.scale, holder_depth);
+    const Floats scale = pick(walk.levels.scale, holder_depth), size = pick(walk.levels.size, holder_depth);
     const float first = static_cast<float>(tree_channels.border) - 0.5f;
     for (int axis = 0; axis < 3; ++axis) {
-      const Floats offset = -face(mask, axis, holder_depth, Mask{}) * scale + first;
+      const Floats offset = -face(mask, axis, holder_depth, size, Mask{}) * scale + first;
       const Floats slope = ray.direction[axis] * scale;
       to.offset[axis] = mask ? (stored ? offset : Floats{}) : to.offset[axis];
       to.slope[axis] = mask ? (stored ? slope : Floats{}) : to.slope[axis];

@@ -30,8 +30,9 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each(like, kernel.order.count(), kernel);
 }
 
-// Traces rays with a fused shader. On CUDA, the voxels' dtype is compiled in for the plain function, filtered or not,
-// and for the usual dtypes of stored colours, lit functions and isosurfaces. On the CPU packets trace nearly all rays.
+// Traces rays with a fused shader. The voxels' dtype is compiled in, on CUDA for the plain function, filtered or not,
+// and for the usual dtypes of stored colours, lit functions and isosurfaces; on the CPU, where packets trace nearly all
+// rays, for the plain function in float32 alone.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
   const auto trace = [&](auto type, auto... voxel) {  // a voxel of the dtype that is compiled in, if any
@@ -66,10 +67,15 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
       if (is(ShaderKind::kIsosurface) && args.voxel == VoxelType::kUInt8) return shallow(surface, uint8_t{});
     }
   }
-  if (args.shader == kPlainShader) {
-    return with_voxel(args.voxel, [&](auto voxel) { trace(ShaderType<Plain<T>, false>{}, voxel); });
-  }
+  constexpr bool kTyped = true;
+#else
+  constexpr bool kTyped = std::is_same_v<T, float>;
 #endif
+  if constexpr (kTyped) {
+    if (args.shader == kPlainShader) {
+      return with_voxel(args.voxel, [&](auto voxel) { trace(ShaderType<Plain<T>, false>{}, voxel); });
+    }
+  }
   with_shader<T>(args.shader, trace);
 }
 

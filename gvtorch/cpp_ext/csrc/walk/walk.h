@@ -1,6 +1,6 @@
 // Traversal of one ray, node by node: finds the node of each visit, marks what is used and what is missing, and finds
 // where the visit ends and which intervals lie in it. A visitor (shade_rays.h, segments.h) defines what is done with
-// them. Packets have their own walk (packet_walk.h).
+// them. Packets have their own walk (packet_path.h, packet_walk.h).
 #pragma once
 
 #include "base/arguments.h"
@@ -155,7 +155,7 @@ struct Walk {
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` enters as the
   // depth that the previous visit wanted. Level of detail: the first depth whose voxel fits into the cone
-  // (packet_walk.h has the same for packets; Levels.wanted in the twin).
+  // (packet_path.h has the same for packets; Levels.wanted in the twin).
   template <class Digits, class ReadWords>
   GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const ReadWords& read_words, int32_t& wanted,
                       bool& missed) const {
