@@ -116,9 +116,7 @@ class SampledDistance(Distance):
         cell = torch.minimum(clamped.floor(), self.last.to(position) - 1)
         weights = clamped - cell
         _, y, x = self.values.shape
-        base_index = cell.nan_to_num().to(
-            torch.int64
-        )  # points that are NaN get values that are NaN
+        base_index = cell.nan_to_num().to(torch.int64)  # where a point is NaN, so is the value
         base_index = (base_index[..., 2] * y + base_index[..., 1]) * x + base_index[..., 0]
         flat = self.values.reshape(-1)
         corners = [
