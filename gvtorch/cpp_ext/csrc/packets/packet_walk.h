@@ -198,7 +198,7 @@ struct PacketWalk : PacketPath {
     }
     leave(found.nothing);
   }
-  GV_HD Found find_nodes(Mask mask) {
+  GV_CALL Found find_nodes(Mask mask) {  // inlined, it makes the march of a projection a seventh slower
     if constexpr (Kernel::kHidesAlike) {
       return find(mask, Shader::kSeesEmpty);
     } else {
