@@ -350,7 +350,15 @@ def test_voxels_of_a_brick_that_turns_out_uniform_do_not_count(dtype, kind, valu
     joined = gv.JoinedProducer({"a": uniform, "b": other})
     for producer, name in ((uniform, "value"), (joined, "a")):
         assert producer.at(points)[name][:, 0].tolist() == [value, 9.0]
+        assert producer.at(points[1:])[name].item() == 9.0, "where no brick is uniform"
     children = gv.FromChildren(uniform)
     layout = Layout.of(children, 8, 1, torch.device("cpu"))
     coarse = children.bricks_at(torch.tensor([[0, 0, 0, 1]]), layout)["value"]
     assert coarse[0, 4, 4, [3, 6], 0].tolist() == [value, 9.0]
+
+
+def test_points_in_a_brick_that_is_an_alias_are_refused():
+    producer = Uniform(32)
+    producer.kind = gv.Region.ALIAS
+    with pytest.raises(ValueError, match=r"^Uniform.at: a brick is not finite, or an alias$"):
+        producer.at(torch.tensor([[3.0, 3, 3]]))

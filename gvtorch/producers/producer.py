@@ -130,12 +130,14 @@ class Bricks(Answer):
         """Returns a channel's voxels; those of EMPTY and CONSTANT items are filled with their
         constants, or 0 without any, since `data` need not hold them.
         """
-        values = self.data[name]
-        if self.kind is None:
+        values, kind = self.data[name], self.kind
+        if kind is None:
+            return values
+        uniform = (kind == Region.EMPTY) | (kind == Region.CONSTANT)
+        if kind.device.type == "cpu" and not uniform.any():  # CUDA would have to wait
             return values
         values = values.gather() if isinstance(values, TableRows) else values
-        kind = self.kind.to(values.device)
-        uniform = (kind == Region.EMPTY) | (kind == Region.CONSTANT)
+        uniform = uniform.to(values.device)
         shape = (len(uniform), *(1,) * 3, -1)[: values.dim()]
         constant = self.constants.get(name, values.new_zeros(len(uniform))).to(values)
         stored = torch.where(uniform.view(shape), movable(constant).view(shape), movable(values))
