@@ -23,7 +23,7 @@ NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/de
 REQUIRE := reference,cpp,io$(if $(CI)$(shell ldconfig -p 2>/dev/null | grep libEGL.so.1),$(COMMA)opengl)
 REQUIRE := $(REQUIRE)$(if $(CI)$(shell command -v chromium chromium-browser google-chrome),$(COMMA)browser)
 # Of 16,000 files of Python, those that are imported are compiled then; all at once would take a minute. The pip that
-# Python brings may be years old and take a minute longer to find what fits together.
+# Python brings may be years old and take three times as long to find what fits together.
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint .ci/constraints.txt
 ARCHS_GIVEN := $(GVTORCH_CUDA_ARCHS)
 export GVTORCH_CUDA_ARCHS ?= $(or $(NATIVE),90)

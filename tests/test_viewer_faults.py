@@ -6,8 +6,11 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -182,6 +185,13 @@ def test_costs_of_a_stream_are_shown_once_nothing_is_missing():
         session.close()
 
 
+def wait_for(condition: Callable[[], Any]) -> None:
+    end = time.monotonic() + TIMEOUT
+    while not condition():
+        assert time.monotonic() < end, "it never came true"
+        time.sleep(0.001)
+
+
 def test_a_question_to_a_view_that_closes_is_answered_at_once(session):
     begun, go = threading.Event(), threading.Event()
 
@@ -201,12 +211,10 @@ def test_a_question_to_a_view_that_closes_is_answered_at_once(session):
 
     asking = threading.Thread(target=ask)
     asking.start()
-    while not session._tasks:
-        pass
+    wait_for(lambda: session._tasks)
     closing = threading.Thread(target=session.close)
     closing.start()
-    while not session._closed:
-        pass
+    wait_for(lambda: session._closed)
     go.set()
     closing.join(TIMEOUT)
     asking.join(TIMEOUT)

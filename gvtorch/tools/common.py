@@ -152,7 +152,8 @@ def open_data(path: str, options: ReadOptions, *, image: str | None, level: int)
     if is_zarr(path):
         refuse_file_flags(options)
         return Store.open(path, image=image, time=options.time or 0)
-    refuse_store_flags(path, ["--image"] * bool(image) + ["--level"] * bool(level))
+    given = {"--image": image, "--level": level}
+    refuse_store_flags(path, [flag for flag, value in given.items() if value])
     return options.read(path)
 
 

@@ -62,7 +62,7 @@ class View:
         aiohttp_web()
         if self.state is not None:
             state = saved_state(self.state)
-            flags = ["--time"] * ("time" in state and self.scene.source.time is not None)
+            flags = ["--time"] if "time" in state and self.scene.source.time is not None else []
             self.scene.look.check_state("--state", state, flags, self.camera)
         scene, shader, camera, options = self._open_path()
         view(

@@ -14,7 +14,7 @@ TINY = 1.1754944e-38  # smallest normal float32: a transmittance not above it co
 
 
 def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
-    """Clamps values; NaN becomes the lower bound."""
+    """Clamps values; NaN becomes the lower bound. Bounds are numbers, or of the values' dtype."""
     raised = torch.where(value > low, value, low)
     return torch.where(raised < high, raised, high)
 

@@ -168,7 +168,7 @@ class Intervals:
         self.base, self.count, level = state_r3.unbind(1)
         self.level = clamp(level, 0, len(self.length_l) - 1).to(torch.int64)
         self.start = self.base + self.count * self.length_l[self.level]
-        self._find_middle()
+        self._update()
 
     def inside(self) -> Tensor:
         """Returns (r,) bool: the interval starts before the far side."""
@@ -196,9 +196,10 @@ class Intervals:
         self.base = torch.where(changes, self.start, self.base)
         self.count = torch.where(changes, 0.0, self.count)
         self.level = torch.where(changes, level, self.level)
-        self._find_middle()
+        self._update()
 
-    def _find_middle(self) -> None:
+    def _update(self) -> None:
+        """Works out the places of the interval, given its level, base and count."""
         self.length = self.length_l[self.level]  # (r,) of whole intervals
         self.whole_end = self.base + (self.count + 1) * self.length  # (r,) where the next starts
         self.cut = ~(self.whole_end <= self.beam.last)  # (r,) bool: cut at the far side

@@ -1,5 +1,6 @@
 // Where the lanes of a packet are: their rays and intervals, and the nodes that they visit. This part of a packet's
-// walk is the same for all shaders and voxels, and is compiled once.
+// walk is the same for all shaders and voxels, and is compiled once; again only for shaders that hide a node from some
+// rays and not from others.
 #pragma once
 
 #include "packets/deep_lanes.h"
