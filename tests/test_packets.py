@@ -9,6 +9,7 @@ import pytest
 import torch
 from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, result, shaded, start
 from helpers.rays import camera_rays
+from helpers.traces import trace
 from torch import Tensor
 
 import gvtorch as gv
@@ -75,6 +76,89 @@ def test_every_bit_is_the_reference_s(of_instructions, instructions, name, branc
     for a, b in zip(actual, expected(name, branching), strict=True):
         assert torch.equal(a.nan_to_num(7), b.nan_to_num(7))
     assert sum(len(a.unique()) for a in actual) > 1000, "the test must see something"
+
+
+def check_bits(tree: gv.N3Tree, size: int, shader: gv.Shader, **options) -> None:
+    """Checks that pictures have the reference's bits."""
+    rays = camera_rays(tree, size, distance=1.4)
+    for lod in ("auto", "finest"):
+        (a, marks_a), (b, marks_b) = (
+            trace(tree, backend, rays, shader, lod=lod, **options)
+            for backend in ("cpp", "reference")
+        )
+        for key, expected in {**b, **marks_b}.items():
+            assert torch.equal({**a, **marks_a}[key].nan_to_num(7), expected.nan_to_num(7)), key
+        assert b["color"].unique().numel() >= 20, "the test must see something"
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.float16, torch.float32])
+@pytest.mark.parametrize(
+    "name",
+    ["plain", "lit", "lit by stored normals", "stored colour", "isosurface", "features"],
+)
+def test_a_pool_of_one_brick_is_read_in_packets(name, dtype):
+    numbers = torch.rand((4, 6, 7, 5), generator=torch.Generator().manual_seed(3))
+    factor = 1 if dtype.is_floating_point else 1.9
+    channels = {"value": numbers[0], "rgba": numbers.movedim(0, -1), "normal": numbers[:3]}
+    channels["normal"] = channels["normal"].movedim(0, -1)
+    volumes = {key: gv.Volume((some * factor).to(dtype)) for key, some in channels.items()}
+    tree = gv.N3Tree.from_volume(volumes, 8)
+    assert tree.bricks.capacity == 1
+    check_bits(tree, 9, SHADERS[name])
+
+
+@pytest.mark.backend("cpp")
+def test_a_pool_without_bricks_is_read_in_packets():
+    """All nodes are constant."""
+    volumes = {
+        "value": gv.Volume(torch.full((9, 9, 9), 0.6)),
+        "normal": gv.Volume(torch.full((9, 9, 9, 3), 0.4)),
+    }
+    tree = gv.N3Tree.from_volume(volumes, 4)
+    assert tree.bricks.capacity == 0
+    check_bits(tree, 9, SHADERS["plain"])
+    check_bits(tree, 9, SHADERS["lit by stored normals and a lamp"])
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("name", ["plain", "lit"])
+def test_bricks_of_more_than_2_to_the_24_numbers_are_read(name):
+    """Float32 can't count them: it would round the place of a voxel in the far half of a brick."""
+    values = torch.rand((300, 6, 5, 3), generator=torch.Generator().manual_seed(5)) * 255
+    tree = gv.N3Tree.from_volume(gv.Volume(values.to(torch.uint8)), 200)
+    assert tree.bricks.bricks["value"][0].numel() > 2**24 and tree.bricks.capacity > 1
+    check_bits(tree, 33, SHADERS[name], component=1)
+
+
+@pytest.mark.backend("cpp")
+def test_nodes_beyond_2_gib_are_found_as_others_are():
+    values = torch.rand((24, 24, 24), generator=torch.Generator().manual_seed(2))
+    tree = gv.N3Tree.from_volume(gv.Volume(values), 4)
+    rays = camera_rays(tree, 9, distance=1.4)
+    tracer = Tracer(tree, TRANSFER, gv.RenderOptions())
+    near, arguments = tracer(rays), tracer.arguments
+    first = 2**26 + 1  # tile; 8 nodes of 4 bytes each
+
+    def far(tensor: Tensor) -> Tensor:
+        # Pages that are never touched take no memory.
+        table = np.zeros((first + len(tensor), *tensor.shape[1:]), tensor.numpy().dtype)
+        table[first:] = tensor.numpy()
+        return torch.from_numpy(table)
+
+    children = arguments.child_tn.clone()
+    children[children >= 0] += first
+    tables = {
+        name: far(getattr(arguments, name))
+        for name in ("constant_tnc", "range_tn2c", "brick_tn", "request_tn", "stamp_t")
+    }
+    tracer.arguments = arguments._replace(
+        **tables, child_tn=far(children), root=arguments.root + 8 * first
+    )
+    hits = tracer(rays)
+    assert near.alpha.max() > 0.3 and (tables["stamp_t"][first:] == tree.frame).any()
+    for field, there in vars(near).items():
+        assert there is None or torch.equal(getattr(hits, field), there), field
 
 
 @pytest.mark.backend("cpp")

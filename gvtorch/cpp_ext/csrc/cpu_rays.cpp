@@ -9,9 +9,14 @@ namespace gvtorch {
 
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool in_float64) {
   if (in_float64) return shade_fused<double>(like, args);
-  if (!(args.shader == kPlainShader ? packets_can_trace(args) : packets_can_shade(args)))
-    return shade_fused<float>(like, args);
-  trace_chunks(like, args, [&](int64_t begin, int64_t end) { processor().chunks.shade(args, begin, end); });
+  with_shader<float>(args.shader, [&](auto type) {
+    using Type = decltype(type);
+    // Packets trace neither cones to a light nor rays through colours by direction.
+    if constexpr (Type::kShadows || Type::Shader::kColored) {
+      if (Type::kShadows || args.voxel_width > 4) return shade_as<float>(like, args, type);
+    }
+    trace_chunks(like, args, processor().chunks.shade);
+  });
 }
 
 }  // namespace gvtorch

@@ -60,12 +60,7 @@ struct LibraryShader {
     const auto run_kernel = [&](const auto& kernel) { shade_each(like, args.nodes, kernel); };
     if (in_float64) return run_kernel(ShadeRay<double, CalledShader<UserShaderOf, double>, Digits<double>>(args));
 #ifdef GV_PACKETS
-    if (packets_can_trace(args)) {
-      return trace_chunks(like, args, [&](int64_t begin, int64_t end) {
-        trace_packets<CalledShader<UserShaderOf, float>, AnyValues>(args, begin, end);
-      });
-    }
-    run_kernel(ShadeRay<float, CalledShader<UserShaderOf, float>, Digits<float>>(args));  // where packets can't
+    trace_chunks(like, args, trace_packets<CalledShader<UserShaderOf, float>, AnyValues>);
 #else
     with_digits<float>(args, [&](auto* digits) {
       run_kernel(ShadeRay<float, CalledShader<UserShaderOf, float>, std::decay_t<decltype(*digits)>>(args));

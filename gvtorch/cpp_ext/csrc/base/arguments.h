@@ -138,7 +138,8 @@ struct TraceArgs {
   uint8_t* hidden_tn;  // scratch, see allocate_node_cache
 
   int64_t rays, bricks, nodes;
-  int64_t table;  // how many numbers table_lm4 has
+  int64_t packet_bricks;  // how many of the bricks, from the first on, packets read; see trace_chunks.h
+  int64_t table;          // how many numbers table_lm4 has
   VoxelType voxel;
   int32_t nodes_per_tile, side;
   int32_t voxel_width;    // numbers per voxel

@@ -83,23 +83,24 @@ GV_HD void for_lanes(Mask mask, const Body& body) {
   for (uint32_t remaining = bits(mask); remaining != 0; remaining &= remaining - 1) body(__builtin_ctz(remaining));
 }
 
-// Loads 4 bytes at each address base + offset.
+// Loads 4 bytes at each address base + kScale * offset.
+template <int kScale = 1>
 GV_HD Ints gather(const void* base, Ints offset) {
 #if defined(__AVX512F__)
-  return (Ints)_mm512_i32gather_epi32((__m512i)offset, base, 1);
+  return (Ints)_mm512_i32gather_epi32((__m512i)offset, base, kScale);
 #elif defined(__AVX2__)
-  return (Ints)_mm256_i32gather_epi32(static_cast<const int*>(base), (__m256i)offset, 1);
+  return (Ints)_mm256_i32gather_epi32(static_cast<const int*>(base), (__m256i)offset, kScale);
 #else
   Ints words;
   for (int lane = 0; lane < kLanes; ++lane) {
     int32_t word;
-    memcpy(&word, static_cast<const char*>(base) + offset[lane], 4);
+    memcpy(&word, static_cast<const char*>(base) + int64_t{kScale} * offset[lane], 4);
     words[lane] = word;
   }
   return words;
 #endif
 }
-GV_HD Ints pick(const int32_t* table, Ints index) { return gather(table, index << 2); }
+GV_HD Ints pick(const int32_t* table, Ints index) { return gather<4>(table, index); }
 // The same for words that other threads may write meanwhile: each is read atomically.
 GV_HD Ints pick_shared(const int32_t* table, Ints index) {
 #if defined(__AVX2__)
@@ -110,7 +111,7 @@ GV_HD Ints pick_shared(const int32_t* table, Ints index) {
   return words;
 #endif
 }
-GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather(table, index << 2); }
+GV_HD Floats pick(const float* table, Ints index) { return (Floats)gather<4>(table, index); }
 
 #ifdef GV_MM
 // Transposes rows of four numbers: rows[i] holds those of the lanes i, i + 4, i + 8, ...; columns[k], number k of
@@ -125,15 +126,13 @@ GV_HD void transpose(const Native rows[4], Floats columns[4]) {
 }
 #endif
 
-// Loads four floats at each address base + offset (a multiple of 16 bytes); columns[0] gets the first of all lanes, and
-// so on. A load per lane and a transposition replace four gathers, which would load each number alone.
-GV_HD void load_rows(const void* base, Ints offset, Floats columns[4]) {
+// Loads four floats at each row of four floats from base on; columns[0] gets the first of all lanes, and so on. A load
+// per lane and a transposition replace four gathers, which would load each number alone.
+GV_HD void load_rows(const float* base, Ints row, Floats columns[4]) {
 #ifdef GV_MM
   int32_t lane[kLanes];
-  memcpy(lane, &offset, sizeof(lane));
-  const auto load_four = [&](int i) {
-    return _mm_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
-  };
+  memcpy(lane, &row, sizeof(lane));
+  const auto load_four = [&](int i) { return _mm_loadu_ps(base + int64_t{4} * lane[i]); };
   Native rows[4];
   for (int i = 0; i < 4; ++i) {
 #if defined(__AVX512F__)
@@ -149,18 +148,16 @@ GV_HD void load_rows(const void* base, Ints offset, Floats columns[4]) {
   }
   transpose(rows, columns);
 #else
-  for (int i = 0; i < 4; ++i) columns[i] = (Floats)gather(static_cast<const float*>(base) + i, offset);
+  for (int i = 0; i < 4; ++i) columns[i] = pick(base + i, row << 2);
 #endif
 }
 
 // Loads two such rows, the second right after the first: half as many loads, twice as wide.
-GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats second[4]) {
+GV_HD void load_row_pairs(const float* base, Ints row, Floats first[4], Floats second[4]) {
 #if defined(__AVX2__)
   int32_t lane[kLanes];
-  memcpy(lane, &offset, sizeof(lane));
-  const auto load_eight = [&](int i) {
-    return _mm256_loadu_ps(reinterpret_cast<const float*>(static_cast<const char*>(base) + lane[i]));
-  };
+  memcpy(lane, &row, sizeof(lane));
+  const auto load_eight = [&](int i) { return _mm256_loadu_ps(base + int64_t{4} * lane[i]); };
   Floats halves[2][4];  // [h][i]: number i of half of the lanes; first rows of four lanes, their second rows, and so on
   for (int h = 0; h < 2; ++h) {
     Native rows[4];
@@ -184,8 +181,8 @@ GV_HD void load_row_pairs(const void* base, Ints offset, Floats first[4], Floats
 #endif
   }
 #else
-  load_rows(base, offset, first);
-  load_rows(static_cast<const char*>(base) + 16, offset, second);
+  load_rows(base, row, first);
+  load_rows(base + 4, row, second);
 #endif
 }
 

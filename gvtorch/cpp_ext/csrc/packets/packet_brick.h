@@ -98,7 +98,7 @@ GV_CALL Row<Floats> read_packet_four(const PacketPool& pool, int64_t shift, Mask
     memcpy(numbers[lane], &blended, sizeof(blended));
   });
   Floats row[4];
-  load_rows(numbers, lane_numbers() << 4, row);
+  load_rows(numbers[0], lane_numbers(), row);
   return {row[0], row[1], row[2], row[3]};
 }
 

@@ -4,8 +4,8 @@
 // This and packet_path.h are a second walk next to that of walk.h, for two reasons. Lanes keep the path of their last
 // descent, and the next descent continues where it departs from that path; a GPU's threads would keep it in local
 // memory, which takes twice as long as to restart from the root. And lanes whose run of intervals has ended wait while
-// the others march on together, until too few are left. Rare cases (the cut interval at the far side, the pool's last
-// brick, a request) are handled lane by lane, by the functions for a single ray.
+// the others march on together, until too few are left. Rare cases (the cut interval at the far side, a brick that
+// packets don't read, a request) are handled lane by lane, by the functions for a single ray.
 #pragma once
 
 #include "packets/packet_path.h"
@@ -46,7 +46,7 @@ struct PacketWalk : PacketPath {
   const Shader& shader;
   const Values values;
   const PacketChannels channels;
-  const int64_t bricks;
+  const int64_t packet_bricks;
   const float stop_clear;
 
   Mask alive;
@@ -66,7 +66,7 @@ struct PacketWalk : PacketPath {
         channels{{kernel.channels.value, args.side, args.bricks},
                  {kernel.channels.normal, args.side, args.bricks},
                  {kernel.channels.other, args.side, args.bricks}},
-        bricks(args.bricks),
+        packet_bricks(args.packet_bricks),
         stop_clear(kernel.stop_clear) {}
 
   // Traces the rays at positions begin to end of the order, at most kLanes.
@@ -217,9 +217,9 @@ struct PacketWalk : PacketPath {
 
   // Begins a run of alike intervals; lanes that need care march alone to the end of the visit at once.
   GV_HD void begin_run(Mask mask) {
-    const Ints last = first_of(Ints{} + static_cast<int32_t>(bricks - 1));
-    const Mask end = (fine.stored & (fine.brick == last)) | (mixed & coarse.stored & (coarse.brick == last));
-    const Mask marches_alone = mask & (intervals.cut() | end);
+    const Ints end = first_of(Ints{} + static_cast<int32_t>(packet_bricks));
+    const Mask beyond = (fine.stored & (fine.brick >= end)) | (mixed & coarse.stored & (coarse.brick >= end));
+    const Mask marches_alone = mask & (intervals.cut() | beyond);
     if (any(marches_alone)) {
       march_alone(marches_alone);
       fine.brick = marches_alone ? Ints{} : fine.brick;  // reads that lanes ignore must stay in the pool too

@@ -248,7 +248,6 @@ struct ShaderFacts {
                                               // each of six directions; only the pool's first bricks have the channel
   static constexpr int32_t kFeatures = 0;     // how many numbers it writes to sum.feature_c; they begin as 0
   static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
-  static bool packets_can_trace(const ShadeArgs&) { return true; }  // whether packets can trace its rays
   template <class V>
   using SumOf = ShadeSum<V>;
   template <class Sum>

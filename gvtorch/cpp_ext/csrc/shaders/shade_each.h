@@ -30,19 +30,20 @@ void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel)
   for_each(like, kernel.order.count(), kernel);
 }
 
-// Traces rays with a fused shader. The voxels' dtype is compiled in, on CUDA for the plain function, filtered or not,
-// and for the usual dtypes of stored colours, lit functions and isosurfaces; on the CPU, where packets trace nearly all
-// rays, for the plain function in float32 alone.
+// Traces rays with a fused shader of ShaderType `type`, and with a voxel of the dtype that is compiled in, if any.
+template <class T, class Type, class... Voxel>
+void shade_as(const torch::stable::Tensor& like, const ShadeArgs& args, Type, Voxel...) {
+  with_digits<T>(args, [&](auto* digits) {
+    using Digits = std::decay_t<decltype(*digits)>;
+    shade_each(like, args.nodes, ShadeRay<T, typename Type::Shader, Digits, Type::kShadows, Voxel...>(args));
+  });
+}
+
+// Traces rays with any fused shader. On CUDA the voxels' dtype is compiled in for the plain function, filtered or not,
+// and for the usual dtypes of stored colours, lit functions and isosurfaces.
 template <class T>
 void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
-  const auto trace = [&](auto type, auto... voxel) {  // a voxel of the dtype that is compiled in, if any
-    using Type = decltype(type);
-    with_digits<T>(args, [&](auto* digits) {
-      using Digits = std::decay_t<decltype(*digits)>;
-      shade_each(like, args.nodes,
-                 ShadeRay<T, typename Type::Shader, Digits, Type::kShadows, decltype(voxel)...>(args));
-    });
-  };
+  const auto trace = [&](auto type, auto... voxel) { shade_as<T>(like, args, type, voxel...); };
 #ifdef __CUDACC__
   const auto is = [&](ShaderKind kind) { return args.shader == static_cast<int32_t>(kind); };
   if (is(ShaderKind::kFiltered)) {
@@ -67,15 +68,10 @@ void shade_fused(const torch::stable::Tensor& like, const ShadeArgs& args) {
       if (is(ShaderKind::kIsosurface) && args.voxel == VoxelType::kUInt8) return shallow(surface, uint8_t{});
     }
   }
-  constexpr bool kTyped = true;
-#else
-  constexpr bool kTyped = std::is_same_v<T, float>;
-#endif
-  if constexpr (kTyped) {
-    if (args.shader == kPlainShader) {
-      return with_voxel(args.voxel, [&](auto voxel) { trace(ShaderType<Plain<T>, false>{}, voxel); });
-    }
+  if (args.shader == kPlainShader) {
+    return with_voxel(args.voxel, [&](auto voxel) { trace(ShaderType<Plain<T>, false>{}, voxel); });
   }
+#endif
   with_shader<T>(args.shader, trace);
 }
 

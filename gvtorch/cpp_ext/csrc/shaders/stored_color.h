@@ -47,7 +47,6 @@ GV_HD auto by_direction(MaskOf<V> mask, const Vec3<V>& d, int32_t width, const R
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
-  static bool packets_can_trace(const ShadeArgs& args) { return args.voxel_width == 4; }
   using Sum = ShadeSum<T>;
   Light<T> light;
 

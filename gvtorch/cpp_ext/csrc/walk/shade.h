@@ -158,7 +158,7 @@ struct Transfer {
 #ifndef __CUDACC__
   GV_HD RowPair<Floats> rows_at(Ints index, int32_t offset = 0) const {
     RowPair<Floats> rows;
-    load_row_pairs(table_lm + offset, index << 4, &rows.first.red, &rows.second.red);
+    load_row_pairs(&table_lm[offset].red, index, &rows.first.red, &rows.second.red);
     return rows;
   }
 #endif
