@@ -33,6 +33,8 @@ SHADERS = {
     "stored colour": gv.StoredColor("rgba"),
     "stored colour, lit": gv.StoredColor("rgba", premultiplied=True, lit=True, light=LAMP),
     "stored colour, stored normals": gv.StoredColor("rgba", lit=True, normals="normal"),
+    "colour by direction": gv.StoredColor("six"),
+    "colour by direction, lit": gv.StoredColor("six", lit=True, normals="normal", light=LAMP),
     "isosurface": gv.Isosurface(0.45, light=LAMP),
     "distance field": gv.DistanceField(offset=0.4),
     "maximum": gv.Projection("maximum", TRANSFER),
@@ -48,7 +50,15 @@ SHADERS = {
 #: Shader and N; trees with N = 3 are deep.
 CASES = [(name, 2) for name in SHADERS]
 CASES += [
-    (name, 3) for name in ("plain", "lit by a lamp", "stored colour", "isosurface", "maximum")
+    (name, 3)
+    for name in (
+        "plain",
+        "lit by a lamp",
+        "stored colour",
+        "colour by direction",
+        "isosurface",
+        "maximum",
+    )
 ]
 
 

@@ -66,9 +66,12 @@ def scene(branching: int = 2) -> gv.N3Tree:
     rgba = numbers[:4].movedim(0, -1).clone()
     rgba[..., 3] *= 0.3 * (value > 0.2)
     normal = torch.nn.functional.normalize(numbers[:3].movedim(0, -1) - 0.5, dim=-1)
+    six = gv.Volume(rgba).directional()
+    six.data = six.data * torch.linspace(0.6, 1.0, 24)  # all six differ
     return gv.N3Tree.from_volume(
         {
             "value": gv.Volume(value),
+            "six": gv.Volume((six.data * 255).round().to(torch.uint8)),
             "rgba": gv.Volume((rgba * 255).round().to(torch.uint8)),
             "normal": gv.Volume((normal * 127).round().to(torch.int8)),
         },

@@ -1,4 +1,4 @@
-// The ops of rays on the CPU: in packets where possible, else ray by ray.
+// The ops of rays on the CPU: in packets; one by one in float64, and where each sample traces a cone to the light.
 
 #include "entry/entry.h"
 #include "packets/processor.h"
@@ -11,10 +11,7 @@ void FusedShaders::run(const Tensor& like, ShadeArgs args, bool in_float64) {
   if (in_float64) return shade_fused<double>(like, args);
   with_shader<float>(args.shader, [&](auto type) {
     using Type = decltype(type);
-    // Packets trace neither cones to a light nor rays through colours by direction.
-    if constexpr (Type::kShadows || Type::Shader::kColored) {
-      if (Type::kShadows || args.voxel_width > 4) return shade_as<float>(like, args, type);
-    }
+    if constexpr (Type::kShadows) return shade_as<float>(like, args, type);
     trace_chunks(like, args, processor().chunks.shade);
   });
 }

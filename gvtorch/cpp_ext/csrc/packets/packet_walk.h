@@ -93,6 +93,11 @@ struct PacketWalk : PacketPath {
     const Floats number = number_in(channel, component, fine, fine_depth, t);
     return any(mixed & marching) ? between(number, number_in(channel, component, coarse, coarse_depth, t), t) : number;
   }
+  GV_HD Row<Floats> four_at(Mask mask, const PacketChannel& channel, int32_t first, Floats t) const {
+    const Row<Floats> row = four_in(mask, channel, first, fine, fine_depth, t);
+    const Mask blended = mixed & mask;
+    return any(blended) ? between(row, four_in(blended, channel, first, coarse, coarse_depth, t), t) : row;
+  }
   GV_HD void numbers_at(const PacketChannel& channel, Components<float> components, int32_t count, Floats t,
                         Floats* out) const {
     numbers_in(channel, components, count, fine, fine_depth, t, out);
@@ -295,6 +300,17 @@ struct PacketWalk : PacketPath {
     for_lanes(marching & ~brick.stored,
               [&](int lane) { number[lane] = channel.constant<float>(node_of(lane, depth), component); });
     return number;
+  }
+  GV_HD Row<Floats> four_in(Mask mask, const PacketChannel& channel, int32_t first, const PacketBrick& brick,
+                            Ints depth, Floats t) const {
+    Row<Floats> row = four_of(mask & brick.stored, channel, first, brick, t);
+    for_lanes(mask & ~brick.stored, [&](int lane) {
+      const auto constant = [&](int32_t number) {
+        return channel.constant<float>(node_of(lane, depth), first + number);
+      };
+      put_lane(row, lane, Row<float>{constant(0), constant(1), constant(2), constant(3)});
+    });
+    return row;
   }
   GV_HD void numbers_in(const PacketChannel& channel, Components<float> components, int32_t count,
                         const PacketBrick& brick, Ints depth, Floats t, Floats* out) const {

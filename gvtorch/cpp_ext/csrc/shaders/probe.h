@@ -214,7 +214,7 @@ struct Probe {
   }
 
   // Four consecutive numbers of a channel at distance t; the voxels around it are found once.
-  GV_HD Row<T> four_at(const ChannelView& channel, int32_t first, T t) const {
+  GV_HD Row<T> four_at(bool, const ChannelView& channel, int32_t first, T t) const {
     const Row<T> row = four_in(channel, first, fine, t);
     return mixed ? between(row, four_in(channel, first, coarse, t), t) : row;
   }

@@ -328,7 +328,7 @@ struct Isosurface : ShaderFacts {
   GV_HD Row<T> color_at(const Probe<T>& probe, T t) const {
     const auto& color_channel = probe.channels.other;
     if (numbers().scale > 0) {
-      const Row<T> stored = probe.four_at(color_channel, 0, t);
+      const Row<T> stored = probe.four_at(true, color_channel, 0, t);
       const T opacity = stored.alpha * numbers().scale;
       const T divisor = numbers().premultiplied > 0 && opacity > 0 ? opacity : 1;
       return {stored.red * numbers().scale / divisor, stored.green * numbers().scale / divisor,

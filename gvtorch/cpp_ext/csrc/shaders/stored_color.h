@@ -42,8 +42,7 @@ GV_HD auto by_direction(MaskOf<V> mask, const Vec3<V>& d, int32_t width, const R
 }
 
 // Voxels that hold a colour: red, green, blue and opacity, or these four for each of six directions (see by_direction).
-// Nodes are hidden by their opacity. Packets trace rays only where a voxel has four numbers; rays through colours by
-// direction are traced one by one.
+// Nodes are hidden by their opacity.
 template <class T>
 struct StoredColor : ShaderFacts {
   static constexpr bool kColored = true;
@@ -63,21 +62,23 @@ struct StoredColor : ShaderFacts {
   };
   GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
   template <class V, class AnyProbe>
-  GV_HD V opacity_of(const Piece<V>& piece, const AnyProbe& probe) const {
-    const V value = probe.channels.value.width == 4 ? piece.value : seen(probe, 3, piece.middle);
-    return saturate(value * numbers().scale);
+  GV_HD V opacity_of(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
+    const auto& channel = probe.channels.value;
+    if (channel.width == 4) return saturate(piece.value * numbers().scale);
+    const auto read = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
+    return saturate(of_sides(mask, probe, read) * numbers().scale);
   }
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
-    return stretch(opacity_of(piece, probe), piece.length / numbers().reference_length);
+    return stretch(opacity_of(true, piece, probe), piece.length / numbers().reference_length);
   }
   template <class V, class AnyProbe, class... Shadow>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
-    const V opacity = opacity_of(piece, probe);
+    const V opacity = opacity_of(mask, piece, probe);
     const MaskOf<V> shown = mask && opacity > 0;
     if (!any(shown)) return;
     probe.select_lanes(shown);
-    const Row<V> stored = four_seen(probe, piece.middle);
+    const Row<V> stored = four_seen(shown, probe, piece.middle);
     const auto color = [&](V number) {
       const V scaled = number * numbers().scale;
       return numbers().premultiplied > 0 ? scaled / opacity : scaled;
@@ -91,30 +92,21 @@ struct StoredColor : ShaderFacts {
     }
     sum.add(row, piece, shown);
   }
-  // All four numbers as seen along the ray; a packet does not read the opacity, which it already has.
-  template <class AnyProbe, class V>
-  GV_HD static Row<V> four_seen(const AnyProbe& probe, V t) {
+  // All four numbers as seen along the ray; of four in all, a packet does not read the opacity, which it already has.
+  template <class V, class AnyProbe>
+  GV_HD static Row<V> four_seen(MaskOf<V> mask, const AnyProbe& probe, V t) {
     const auto& channel = probe.channels.value;
+    const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_at(lanes, channel, first, t); };
+    if (channel.width > 4) return of_sides(mask, probe, read);
     if constexpr (kPacket<V>) {
       return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
     } else {
-      if (channel.width == 4) return probe.four_at(channel, 0, t);
-      return of_sides(probe, [&](bool, int32_t offset) { return probe.four_at(channel, offset, t); });
+      return read(true, 0);
     }
   }
-  // One of the four numbers as seen along the ray.
-  template <class AnyProbe, class V>
-  GV_HD static V seen(const AnyProbe& probe, int32_t number, V t) {
-    const auto& channel = probe.channels.value;
-    if constexpr (kPacket<V>) {
-      return probe.number_at(channel, number, t);
-    } else {
-      return of_sides(probe, [&](bool, int32_t offset) { return probe.number_at(channel, number + offset, t); });
-    }
-  }
-  template <class AnyProbe, class Read>
-  GV_RARE static auto of_sides(const AnyProbe& probe, const Read& read) {
-    return by_direction(true, probe.sight.direction, probe.channels.value.width, read);
+  template <class Mask, class AnyProbe, class Read>
+  GV_RARE static auto of_sides(Mask mask, const AnyProbe& probe, const Read& read) {
+    return by_direction(mask, probe.sight.direction, probe.channels.value.width, read);
   }
 };
 
