@@ -12,7 +12,7 @@ from ..shading import LabelNumbers
 from .exact import clamp, dot, larger, smaller, stretch, unit
 from .lit import Lit
 from .march import Piece, Probe
-from .rays import INF, Beam
+from .rays import INF
 from .tree import ChannelBricks, Holder
 
 _MAX_REACH = 3  # voxels
@@ -30,10 +30,10 @@ class Nearest:
 class LabelBricks(ChannelBricks):
     """One component of a channel of labels."""
 
-    def nearest(self, holder: Holder, beam: Beam, t: Tensor) -> Nearest:
+    def nearest(self, holder: Holder, t: Tensor) -> Nearest:
         """Returns the voxels at distances t (r,)."""
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
-        position = self.positions(holder, beam, t)
+        position = holder.at(t)
         low, high = self.border, side - 1 - self.border
         clamped = clamp(position + 0.5, low, high + 1)
         cell = smaller(torch.floor(clamped), torch.full_like(clamped, high))
@@ -110,7 +110,7 @@ class Labels(Lit):
         color, alpha, normal = blended.split((3, 1, 3), 1)
         hidden = ~(self.contribution(piece, probe, fine)[:, 3] > 0)
         holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
-        label = self.row_of(self.channel.nearest(holder, probe.beam, piece.middle).value)
+        label = self.row_of(self.channel.nearest(holder, piece.middle).value)
         clear_after, clear, hit_clear = (
             self.sum.clear * (1 - alpha[:, 0]),
             self.sum.clear,
@@ -133,7 +133,7 @@ class Labels(Lit):
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
         t, table = piece.middle, self.transfer.table_lm4
-        nearest = self.channel.nearest(holder, probe.beam, t)
+        nearest = self.channel.nearest(holder, t)
         level = torch.where(piece.odd, 0, piece.level)
         color, alpha = table[level, self.row_of(nearest.value)].split((3, 1), 1)
         stretched = stretch(alpha[:, 0], piece.lengths)[:, None]

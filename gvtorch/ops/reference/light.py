@@ -17,7 +17,7 @@ from torch import Tensor
 from ..shading import FAINT, LightKind, ShadeParameters
 from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
-from .rays import INF, Intervals, split
+from .rays import INF, Intervals, rounded
 from .tree import ChannelBricks
 
 #: Factors from one octave of scattering to the next, of its light and of its directedness; fitted
@@ -216,11 +216,11 @@ class Shadows:
             direction[ray_index],
             self.walk.intervals.beam[ray_index],
         )
-        origin, rest = split(eye_beam.along(t), eye_beam.deep, t.dtype)
+        origin, exact_origin = rounded(eye_beam.along(t), eye_beam.scene.deep, t.dtype)
         beam = replace(
             eye_beam,
             origin=origin,
-            rest=rest,
+            exact_origin=exact_origin,
             direction=direction / self.cube,
             cone_near=eye_beam.cone(t),
             cone_growth=growth[ray_index] * self.cone_scale,

@@ -120,9 +120,10 @@ def sample_bricks(
 
     node_fields = (segments.node, segments.brick, segments.depth)
     nodes, bricks, depths = (field.to(torch.int64)[segment].unbind(1) for field in node_fields)
-    levels, position = Levels(args, real), beam.at(lookup_t)
+    levels = Levels(args, real)
+    finest = levels.finest_cells(beam.at(lookup_t))
     fine, coarse = (
-        levels.holder(node, brick, depth, position)
+        levels.holder(node, brick, depth, finest, beam)
         for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)
     )
     channel = ChannelBricks.of(args)

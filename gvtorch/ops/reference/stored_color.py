@@ -113,14 +113,14 @@ class Filtered(Lit):
 
     def function_row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 4) the transfer function's rows for one node's values."""
-        value = self.channel.sample(holder, probe.beam, piece.middle)
+        value = self.channel.sample(holder, piece.middle)
         return self.transfer.interval(value, piece)
 
     def reader(self, piece: Piece, probe: Probe, holder: Holder) -> Callable[[int], Tensor]:
         """Returns a function that reads one number (r,) of a node's filtered colours."""
         brick = torch.where(self.has_colors(holder), holder.brick, EMPTY)
         colored = replace(holder, brick=brick)
-        return lambda number: self.others[number].sample(colored, probe.beam, piece.middle)
+        return lambda number: self.others[number].sample(colored, piece.middle)
 
     def seen_colors(
         self, color_width: int, read: Callable[[int], Tensor], piece: Piece, holder: Holder
