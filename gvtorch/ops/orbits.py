@@ -29,6 +29,7 @@ class Orbit(NamedTuple):
         """Raises ValueError unless all tensors have the dtype and device of `like` and their
         shapes, and numbers are in range. `fields`: name, tensor and shape of each other argument.
         """
+        check.instance(context, fields[0][0], like, Tensor)
         if like.dtype not in (torch.float32, torch.float64):
             got = check.describe(like)
             raise ValueError(f"{context}: {fields[0][0]} must be float32 or float64, got {got}")

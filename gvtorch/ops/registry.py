@@ -256,8 +256,12 @@ FAKES: dict[str, Callable[..., Any]] = {
 }
 
 
-#: Ops that return floats of inputs that may require a gradient, and have no backward.
-WITHOUT_GRADIENTS = ("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds")
+#: Ops that return floats of inputs that may require a gradient, and have no backward. (Those that
+#: are one themselves would otherwise lose second derivatives.)
+WITHOUT_GRADIENTS = (
+    *("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds"),
+    *("sample_bricks_backward", "composite_backward"),
+)
 
 _libraries: dict[str, torch.library.Library] = {}  # kernels last as long as these
 

@@ -33,7 +33,7 @@ class Rows:
         )
 
 
-class Scene(NamedTuple):
+class SceneBox(NamedTuple):
     """The part of the root cube that holds the scene, in tree units; its low corner is 0."""
 
     high: Tensor  # (3,) float64 corner
@@ -45,7 +45,7 @@ class Scene(NamedTuple):
 class Beam(Rows):
     """Rays in tree units that start where they enter the scene; distances stay world lengths."""
 
-    scene: Scene
+    scene: SceneBox
     origin: Tensor  # (r, 3)
     exact_origin: Tensor  # (r, 3) float64; more exact than `origin` only where the tree is deep
     direction: Tensor  # (r, 3)
@@ -70,7 +70,7 @@ class Beam(Rows):
         near_cone, growth = (rays.cone_r2 * args.cone_scale).unbind(1)
         high_real, deep = high.to(real), is_deep(args)
         last_real = (high_real * torch.tensor(0.9999999).to(high_real)).double()
-        scene = Scene(high, high * (1 - 2.0**-50) if deep else last_real, deep)
+        scene = SceneBox(high, high * (1 - 2.0**-50) if deep else last_real, deep)
         columns = (
             direction,
             near_cone + growth * moved,
