@@ -5,7 +5,6 @@ csrc/shaders/channels.h, which gives the formula and the layout of the table.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -57,9 +56,9 @@ class ChannelTable:
         total = torch.zeros_like(piece.middle)
         color = total[:, None].expand(-1, 3)
         level = torch.where(piece.odd, 0, piece.level)
+        numbers = probe.numbers(probe.channel, piece.middle)
         for rows in self.channels:
-            component = replace(probe.channel, component=rows.component)
-            row = rows.look_up(probe.number(component, piece.middle), level)
+            row = rows.look_up(numbers[:, rows.component], level)
             halvings = row[:, 3]
             color = color + halvings[:, None] * row[:, :3]
             total = larger(total, halvings) if self.additive else total + halvings

@@ -81,9 +81,13 @@ class Probe:
         """Returns (r,) values at distances t (r,)."""
         return self.number(self.channel, t)
 
-    def number(self, bricks: ChannelBricks, t: Tensor) -> Tensor:
-        """Returns (r,) numbers of any channel at distances t (r,)."""
-        return self.blend(t, lambda holder: bricks.sample(holder, t))
+    def number(self, channel: ChannelBricks, t: Tensor) -> Tensor:
+        """Returns (r,) numbers of any channel at distances t (r,): its component."""
+        return self.blend(t, lambda holder: channel.sample(holder, t))
+
+    def numbers(self, channel: ChannelBricks, t: Tensor) -> Tensor:
+        """Returns (r, c) all numbers of any channel at distances t (r,)."""
+        return self.blend(t, lambda holder: channel.samples(holder, t))
 
     def gradient(self, t: Tensor, cube: Tensor) -> Tensor:
         """Returns (r, 3) gradients per world unit, over one voxel; `cube` (3,): root cube size."""

@@ -128,9 +128,7 @@ def sample_bricks(
     )
     channel = ChannelBricks.of(args)
     probe = Probe(beam, NodePair(fine, coarse, *levels.voxels(depths[2])), channel)
-    components = channel.components(args.bricks_bzyxc, args.constant_tnc)
-    values = torch.stack([probe.number(component, t) for component in components], 1)
-    return torch.where(valid[:, None], values, 0.0)
+    return torch.where(valid[:, None], probe.numbers(channel, t), 0.0)
 
 
 def composite(

@@ -195,7 +195,7 @@ class Tree:
 
 @dataclass
 class ChannelBricks:
-    """One component of one channel."""
+    """A channel, and which of a voxel's numbers is read: its component."""
 
     bricks_bzyxc: Tensor
     constant_nc: Tensor
@@ -208,14 +208,19 @@ class ChannelBricks:
         constant_nc, range_n2c = args.constant_tnc.flatten(0, 1), args.range_tn2c.flatten(0, 1)
         return cls(args.bricks_bzyxc, constant_nc, range_n2c, args.border, args.component)
 
-    def components(self, bricks: Tensor | None, constants: Tensor | None) -> tuple[Self, ...]:
-        """Returns every number of another channel of the same nodes; () where that is None."""
+    def other(self, bricks: Tensor | None, constants: Tensor | None, component: int) -> Self | None:
+        """Returns another channel of the same nodes; None where there is none."""
         if bricks is None:
-            return ()
+            return None
         if constants is None:  # a coarse channel, whose constants are never used
             constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
-        other_bricks = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
-        return tuple(replace(other_bricks, component=c) for c in range(bricks.shape[4]))
+        constant_nc = constants.flatten(0, 1)
+        return replace(self, bricks_bzyxc=bricks, constant_nc=constant_nc, component=component)
+
+    @property
+    def width(self) -> int:
+        """How many numbers a voxel has."""
+        return self.bricks_bzyxc.shape[4]
 
     def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
@@ -227,29 +232,41 @@ class ChannelBricks:
         constant = self.constant_nc[:, self.component]
         return constant[a] == constant[b]
 
-    def constant(self, holder: Holder, real: torch.dtype) -> Tensor:
-        """Returns (r,) constants of nodes, 0 where there is no node."""
-        constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
-        return torch.where(holder.node >= 0, constant, 0.0)
+    def constants(self, holder: Holder, real: torch.dtype) -> Tensor:
+        """Returns (r, c) constants of nodes, 0 where there is no node."""
+        constant_rc = self.constant_nc[holder.node.clamp(min=0)].to(real)
+        return torch.where(holder.node[:, None] >= 0, constant_rc, 0.0)
+
+    @property
+    def single(self) -> ChannelBricks:
+        """The channel without the numbers that are not read."""
+        c = slice(self.component, self.component + 1)
+        return ChannelBricks(
+            self.bricks_bzyxc[..., c], self.constant_nc[:, c], self.range_n2c, self.border, 0
+        )
 
     def sample(self, holder: Holder, t: Tensor, shift: Tensor | float = 0.0) -> Tensor:
-        """Returns (r,) trilinear values at distances t (r,); the node's constant where it has no
+        """Returns (r,) values of the component, or (..., r); see `samples`."""
+        return self.single.samples(holder, t, shift)[..., 0]
+
+    def samples(self, holder: Holder, t: Tensor, shift: Tensor | float = 0.0) -> Tensor:
+        """Returns (r, c) trilinear values at distances t (r,); the node's constants where it has no
         brick, 0 where there is no node. `shift` (..., 1, 3) voxels, if given, is added to
-        positions; the result is then (..., r).
+        positions; the result is then (..., r, c).
         """
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
-        constant, position = self.constant(holder, real), holder.at(t) + shift
+        constant, position = self.constants(holder, real), holder.at(t) + shift
         if self.bricks_bzyxc.shape[0] == 0:
-            return constant.expand(position.shape[:-1])
+            return constant.expand(*position.shape[:-1], -1)
         position = clamp(position, 0, side - 1)
         cell = smaller(torch.floor(position), torch.full_like(position, side - 2))
-        wx, wy, wz = (position - cell).unbind(-1)
+        wx, wy, wz = (position - cell)[..., None].unbind(-2)
         pair = torch.arange(2, device=t.device)[:, None]
         x, y, z = (cell.to(torch.int64)[..., None, :] + pair).unbind(-1)
         corners = (z[..., :, None, None], y[..., None, :, None], x[..., None, None, :])
         brick = holder.brick.clamp(min=0)[:, None, None, None]
-        value_rzyx = self.bricks_bzyxc[(brick, *corners, self.component)].to(real)
-        left, right = value_rzyx.unbind(-1)
-        low, high = (left + wx[..., None, None] * (right - left)).unbind(-1)
-        near, far = (low + wy[..., None] * (high - low)).unbind(-1)
-        return torch.where(holder.brick >= 0, near + wz * (far - near), constant)
+        value_rzyxc = self.bricks_bzyxc[(brick, *corners)].to(real)
+        left, right = value_rzyxc.unbind(-2)
+        low, high = (left + wx[..., None, None] * (right - left)).unbind(-2)
+        near, far = (low + wy[..., None] * (high - low)).unbind(-2)
+        return torch.where(holder.brick[:, None] >= 0, near + wz * (far - near), constant)
