@@ -183,3 +183,17 @@ def test_second_derivatives_are_not_lost():
     assert slope("reference").requires_grad
     with pytest.raises(RuntimeError, match="gradients by grad_sum_rc would be lost"):
         slope("cpp")
+
+
+def test_matrices_of_opengl_are_numbers():
+    good = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, -1], [0, 0, -1, 0]])
+    learned = good.clone().requires_grad_()
+    for wrong in ("x", None, good * 1j, good * torch.nan):
+        assert "projection must be" in line_of(lambda w=wrong: gv.opengl.camera(w, good, 4, 4))
+        assert "modelview must be" in line_of(lambda w=wrong: gv.opengl.camera(good, w, 4, 4))
+    with pytest.raises(RuntimeError, match="gradients by projection would be lost"):
+        gv.opengl.camera(learned, torch.eye(4), 4, 4)
+    assert "camera must be a Camera" in line_of(lambda: gv.opengl.matrices(None, 1.0))
+    assert "near must be a number" in line_of(
+        lambda: gv.opengl.matrices(gv.Camera.look_at((0, 0, 3), (0, 0, 0)), "1")
+    )

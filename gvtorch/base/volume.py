@@ -272,6 +272,7 @@ def _as_labels(
     context: str, data: Tensor | np.ndarray, nan: float | None
 ) -> tuple[Tensor | np.ndarray, Tensor | None]:
     """Returns labels as bricks hold them, and the table of labels if they are indexed."""
+    device = data.device if isinstance(data, Tensor) else None
     if isinstance(data, Tensor):
         data = to_numpy(data)
     if not isinstance(data, np.ndarray) or data.ndim not in (3, 4) or not data.size:
@@ -279,7 +280,8 @@ def _as_labels(
     if data.dtype.kind == "f" and nan is not None:
         data = np.where(np.isfinite(data), data, nan)
     values, labels = stored_labels(context, data)
-    return _as_tensor(context, values), None if labels is None else torch.from_numpy(labels)
+    tensor = _as_tensor(context, values).to(device)
+    return tensor, None if labels is None else torch.from_numpy(labels)
 
 
 def _as_tensor(context: str, data: Tensor | np.ndarray) -> Tensor:

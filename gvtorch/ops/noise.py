@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..base import check
 from .reference import noise as twin
-from .registry import Backend, uncached_backend
+from .registry import Backend, runs_twin
 
 KINDS = twin.KINDS
 
@@ -46,7 +46,7 @@ def noise(
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
     """
     context = "noise"
-    device = check.instance(context, "point_pn", point_pn, Tensor).device
+    check.instance(context, "point_pn", point_pn, Tensor)
     n = point_pn.shape[1] if point_pn.dim() == 2 else 0
     if n not in (2, 3) or point_pn.dtype not in (torch.float32, torch.float64):
         got = check.describe(point_pn)
@@ -65,9 +65,7 @@ def noise(
         KINDS.index(kind),
         twin.NoiseArguments(twin.salts(seed), (x, y, z), jitter, reach),
     )
-    needs_gradient = torch.is_grad_enabled() and point_pn.requires_grad
-    chosen_backend = uncached_backend(backend, device)
-    if chosen_backend == "reference" or (needs_gradient and backend == "auto"):
+    if runs_twin(backend, point_pn):
         return twin.noise(point_pn, kind_index, arguments)
     scalars = (*(salt & 0xFFFFFFFF for salt in arguments.salt), x, y, z, jitter, reach)
     return torch.ops.gvtorch.noise(point_pn.contiguous(), kind_index, *scalars)
