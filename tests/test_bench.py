@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -77,6 +78,8 @@ def test_what_cant_run_here_is_left_out_of_all(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "moderngl", None)
     with pytest.raises(bench.Unavailable, match="opengl needs moderngl"):
         bench.run("opengl", CPU)
+    with pytest.raises(bench.Unavailable, match="no case of compact has 'slots' in its name"):
+        bench.run("compact", replace(CPU, only="slots"))  # a case of lru
     names = []
 
     def run_workload(self, name):

@@ -58,7 +58,7 @@ def test_compact_requests_lists_open_requests_and_keeps_pending_ones(
     listed=st.integers(1, 20),
     batch=st.integers(1, 30),
     coarse_first=st.booleans(),
-    room=st.tuples(st.integers(0, 30), st.integers(0, 30)),
+    room=st.tuples(st.integers(-2, 30), st.integers(-2, 30)),
 )
 def test_requests_are_chosen_by_list_level_and_size(
     backend, data, listed, batch, coarse_first, room
@@ -93,7 +93,8 @@ def test_requests_are_chosen_by_list_level_and_size(
                 candidates.append(((number, level, -size, index), n, word, size))
     candidates.sort()
     for row, (kind, limit) in enumerate(((LOAD, room[1]), (SUBDIVIDE, room[0]))):
-        chosen = [(n, size) for _, n, word, size in candidates if word & kind][: min(batch, limit)]
+        chosen = [(n, size) for _, n, word, size in candidates if word & kind]
+        chosen = chosen[: max(0, min(batch, limit))]
         expected = [*chosen, *[(-1, 0)] * (batch - len(chosen))]
         assert list(zip(node[row].tolist(), priority[row].tolist(), strict=True)) == expected
 

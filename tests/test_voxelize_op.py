@@ -69,6 +69,20 @@ def test_float64_agrees_to_rounding(compiled):
         assert torch.allclose(a.double(), b.double(), rtol=0, atol=1e-12)
 
 
+def test_triangles_beyond_float32_are_nowhere(backend):
+    """Where their distances overflow: they neither count nor hide others, alone or among them."""
+    *mesh, low, size, side, thickness = cubes(8, DEVICES[backend])
+    far = torch.full((1, 3, 3), 1e300, dtype=torch.float64, device=DEVICES[backend])
+    for triangles in (far, torch.cat((mesh[0], far))):
+        hierarchy = Hierarchy(triangles)
+        corner, solid = triangles[hierarchy.order].contiguous(), torch.ones(len(triangles)).bool()
+        arguments = (corner, solid.to(low.device), hierarchy.box, low, size, side, thickness)
+        result = voxelize(*arguments, weights=True, backend=backend)
+        assert (corner[result.nearest[result.nearest >= 0]] < 1e300).all()
+        assert torch.equal(result.distance < torch.inf, result.nearest >= 0)
+        assert (result.nearest >= 0).any() == (len(corner) > 1)
+
+
 def test_a_large_hierarchy_is_gone_through(compiled):
     """5,000 triangles in five levels of boxes, against brute force."""
     args = cubes(6, DEVICES[compiled], each=5000)

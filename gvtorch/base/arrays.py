@@ -17,7 +17,7 @@ from .image_info import ChannelInfo, ImageInfo
 from .labels import check_narrowed
 from .named_axes import ask_axes, axes_placement, even_steps, named_axes
 from .units import spacing_of
-from .volume import Volume, check_extent
+from .volume import Volume, check_extent, plain_tensor, to_numpy
 
 #: Attributes by which NetCDF and HDF5 files specify how stored numbers map to values.
 _PACKING_ATTRIBUTES = (
@@ -145,11 +145,14 @@ def as_volume(
     """
     if isinstance(given, Volume):
         return given
+    first_time = 0 if time is None else time
     if isinstance(given, Tensor):
         axis_letters = ask_axes(context, given.shape, axes)
-        if axis_letters in ("zyx", "zyxc"):  # not by way of NumPy, which lacks bfloat16
-            return Volume(given, spacing or (1, 1, 1), origin or (0, 0, 0), nan=nan)
-        array = ArrayLike.of(context, given.detach().cpu().numpy(), axis_letters)
+        if axis_letters in ("zyx", "zyxc"):  # it stays on its device
+            check.integer(context, "time", first_time, low=0, high=0)
+            spacing = (1, 1, 1) if spacing is None else spacing
+            return Volume(given, spacing, (0, 0, 0) if origin is None else origin, nan=nan)
+        array = ArrayLike.of(context, to_numpy(plain_tensor(context, given)), axis_letters)
     else:
         array = ArrayLike.of(context, given, axes)
     times = array.shape[array.axes.index("t")] if "t" in array.axes else 1
@@ -160,7 +163,7 @@ def as_volume(
             f"{times - 1}",
             stacklevel=2,
         )
-    time_index = check.integer(context, "time", time or 0, low=0, high=max(times - 1, 0))
+    time_index = check.integer(context, "time", first_time, low=0, high=max(times - 1, 0))
     if array.dropped:
         warnings.warn(f"{context}: not kept: {'; '.join(array.dropped)}", stacklevel=2)
     return Volume(

@@ -157,10 +157,10 @@ def float_dtype(context: str, dtype: Any) -> None:
 def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
     """Raises ValueError, which lists the known values, unless `value` is one of them."""
     choices = [*allowed]
-    if value not in choices:
+    if getattr(value, "ndim", 0) or value not in choices:  # arrays have no truth value
         *others, last = map(repr, choices or [None])
         listing = f"{', '.join(others)} or {last}" if others else last
-        raise ValueError(f"{context}: {name} must be {listing}, got {value!r}")
+        raise ValueError(f"{context}: {name} must be {listing}, got {quoted(value)}")
 
 
 def channel(context: str, name: str, channels: Collection[str], owner: str = "the tree") -> None:
@@ -214,13 +214,20 @@ def images(context: str, name: str, value: Any, channels: int, *, batch: bool = 
 
 
 def device(context: str, value: Any) -> torch.device:
-    """Returns a device, CUDA always with an index (as in `tensor.device`); ValueError if absent."""
+    """Returns a device as in `tensor.device`, CUDA always with an index; ValueError if absent."""
     try:
         parsed = torch.device(value)
     except (RuntimeError, TypeError):
-        raise ValueError(f"{context}: device must name a device, got {value!r}") from None
+        raise ValueError(f"{context}: device must name a device, got {quoted(value)}") from None
+    if parsed.type == "cpu":
+        return torch.device("cpu")  # as in `tensor.device`, whatever the index
     if parsed.type != "cuda":
-        return parsed
+        try:
+            return torch.empty(0, device=parsed).device
+        except (RuntimeError, AssertionError):
+            raise ValueError(
+                f"{context}: device {str(parsed)!r} can't be used here: torch lacks it"
+            ) from None
     if not torch.cuda.is_available():
         raise ValueError(f"{context}: device 'cuda' can't be used here: torch sees no CUDA device")
     index = torch.cuda.current_device() if parsed.index is None else parsed.index
@@ -261,7 +268,7 @@ def nbytes(context: str, name: str, value: Any) -> int:
             raise ValueError(
                 f'{context}: {name} must be bytes, as in "256 MB", got {quoted(value)}'
             )
-        value = int(float(match[1]) * unit)
+        value = int(min(float(match[1]) * unit, 2.0**63))
     return integer(context, name, value, low=1, high=2**62)
 
 
@@ -282,11 +289,15 @@ def number(
     high: float = math.inf,
     open_low: bool = False,
 ) -> float:
-    """Returns `value` as a float; ValueError unless finite and in [low, high] (or (low, high])."""
+    """Returns `value` as a float; ValueError unless finite and in [low, high] (or (low, high]).
+    Texts, bools and complex numbers are none, though `float` takes some of them.
+    """
     no_gradient(context, name, value)
     try:
+        if isinstance(value, (str, bytes, bool)) or _is_complex(value):
+            raise TypeError
         result = float(value)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors
         raise ValueError(f"{context}: {name} must be a number, got {quoted(value)}") from None
     inside = low < result <= high if open_low else low <= result <= high
     if not (math.isfinite(result) and inside):
@@ -294,6 +305,10 @@ def number(
         upper = f" and <= {high:g}" if high < math.inf else ""
         raise ValueError(f"{context}: {name} must be finite{lower}{upper}, got {quoted(value)}")
     return result
+
+
+def _is_complex(value: Any) -> bool:
+    return "complex" in str(getattr(value, "dtype", ""))
 
 
 def integer(context: str, name: str, value: Any, *, low: int, high: int = sys.maxsize) -> int:
@@ -342,7 +357,7 @@ def triple(
 def box(context: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Returns two corners, (x, y, z) each; ValueError unless all sides are positive."""
     if not hasattr(value, "__len__") or len(value) != 2:
-        raise ValueError(f"{context}: box must be two corners, got {value!r}")
+        raise ValueError(f"{context}: box must be two corners, got {quoted(value)}")
     low, high = (triple(context, "box", corner) for corner in value)
     sides = [b - a for a, b in zip(low, high, strict=True)]
     triple(context, "sides of the box", sides, positive=True)
@@ -382,6 +397,8 @@ def json_file(kind: str, path: str | Path) -> Any:
 def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
     """Returns a float64 CPU tensor; ValueError unless finite and of `shape`, if that is given."""
     no_gradient(context, name, value)
+    if _is_complex(value):
+        raise ValueError(f"{context}: {name} must be real numbers, got {quoted(value)}")
     try:
         numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
     except (TypeError, ValueError, RuntimeError, OverflowError):

@@ -35,6 +35,10 @@ class Rays:
     # index of the ray. `Lighting` derives its directions from it.
     sample: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("origin", "direction", "cone", "range"):
+            check.instance("Rays", name, getattr(self, name), Tensor)
+
     def __getitem__(self, index: Tensor | slice) -> Rays:
         """Returns some of the rays; they no longer count as rows of a picture (width 0)."""
         return self._convert_columns(lambda column: column[index], 0)

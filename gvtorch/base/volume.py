@@ -28,6 +28,7 @@ CHANNEL_DTYPES = (
     torch.float32,
 )
 
+_NUMPY_FLOATS = (torch.float16, torch.float32, torch.float64)
 #: The viewing directions of `Volume.directional`, in the order of its numbers.
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
 
@@ -96,19 +97,19 @@ class Volume:
                 `Labels`. Also true if `info.labels` is.
 
         Raises:
-            ValueError: data is empty, of another shape or dtype, has more than 2^31 voxels or
-                holds values that are not finite, or integers beyond 2^24, which float32 can't
-                all represent; spacing is not positive, or the origin lies more than 2^50 voxels
-                from 0. Or labels are not whole numbers, or there are more than 2^24 of them.
+            ValueError: data is empty, of another shape, dtype or layout, a masked array (which
+                `gv.as_volume` takes), has more than 2^31 voxels or holds values that are not
+                finite, or integers beyond 2^24, which float32 can't all represent; spacing is not
+                positive, or the origin lies more than 2^50 voxels from 0. Or labels are not whole
+                numbers, or there are more than 2^24 of them.
             RuntimeError: data requires gradients, and autograd is recording.
         """
         context = f"Volume {name!r}" if name != "volume" else "Volume"
-        if isinstance(data, Tensor) and data.requires_grad and torch.is_grad_enabled():
-            raise RuntimeError(
-                f"{context}: data requires gradients, which a volume does not keep: take detach(); "
-                'to learn voxels, let tree.bricks["value"] require gradients and render with a '
-                "gv.ModuleShader"
-            )
+        if isinstance(data, Tensor):
+            data = plain_tensor(context, data)
+        elif isinstance(data, np.ma.MaskedArray):
+            raise ValueError(f"{context}: data is a masked array, which gv.as_volume takes")
+        nan = None if nan is None else check.number(context, "nan", nan)
         info = ImageInfo() if info is None else check.instance(context, "info", info, ImageInfo)
         if labels or info.labels:
             info, self.filter = replace(info, labels=True), "majority"
@@ -238,9 +239,28 @@ class Volume:
         )
 
 
+def plain_tensor(context: str, data: Tensor) -> Tensor:
+    """Returns voxels without gradients, and without a sign that torch has yet to change.
+
+    Raises:
+        RuntimeError: They require gradients, and autograd is recording.
+        ValueError: They are sparse, quantized, or have no data (device meta).
+    """
+    if data.requires_grad and torch.is_grad_enabled():
+        raise RuntimeError(
+            f"{context}: data requires gradients, which a volume does not keep: take detach(); "
+            'to learn voxels, let tree.bricks["value"] require gradients and render with a '
+            "gv.ModuleShader"
+        )
+    if data.layout != torch.strided or data.is_quantized or data.is_meta:
+        raise ValueError(f"{context}: data must be a dense tensor, got {check.describe(data)}")
+    return data.detach().resolve_neg()
+
+
 def to_numpy(values: Tensor) -> np.ndarray:
-    """Returns voxels as an array; bfloat16, which NumPy lacks, as float32."""
-    return (values.float() if values.dtype == torch.bfloat16 else values).cpu().numpy()
+    """Returns voxels as an array; floats that NumPy lacks, such as bfloat16, as float32."""
+    in_numpy = not values.is_floating_point() or values.dtype in _NUMPY_FLOATS
+    return (values if in_numpy else values.float()).cpu().numpy()
 
 
 def movable(tensor: Tensor) -> Tensor:
@@ -252,19 +272,21 @@ def _as_labels(
     context: str, data: Tensor | np.ndarray, nan: float | None
 ) -> tuple[Tensor | np.ndarray, Tensor | None]:
     """Returns labels as bricks hold them, and the table of labels if they are indexed."""
+    device = data.device if isinstance(data, Tensor) else None
     if isinstance(data, Tensor):
-        data = to_numpy(data.detach())
+        data = to_numpy(data)
     if not isinstance(data, np.ndarray) or data.ndim not in (3, 4) or not data.size:
         return data, None  # `_as_tensor` and `Volume` raise the error
     if data.dtype.kind == "f" and nan is not None:
         data = np.where(np.isfinite(data), data, nan)
     values, labels = stored_labels(context, data)
-    return _as_tensor(context, values), None if labels is None else torch.from_numpy(labels)
+    tensor = _as_tensor(context, values).to(device)
+    return tensor, None if labels is None else torch.from_numpy(labels)
 
 
 def _as_tensor(context: str, data: Tensor | np.ndarray) -> Tensor:
     if isinstance(data, Tensor):
-        tensor = data.detach()
+        tensor = data
     elif isinstance(data, np.ndarray):
         if data.dtype.kind not in "biuf":
             raise ValueError(f"{context}: data must hold numbers, got dtype {data.dtype}")
@@ -280,7 +302,8 @@ def _as_tensor(context: str, data: Tensor | np.ndarray) -> Tensor:
         return tensor
     if tensor.is_complex():
         raise ValueError(f"{context}: data must hold real numbers, got {check.describe(tensor)}")
-    check_narrowed(context, tensor.cpu().numpy())
+    if not tensor.is_floating_point():
+        check_narrowed(context, tensor.cpu().numpy())
     return tensor.to(torch.float32)
 
 

@@ -43,15 +43,15 @@ _MODULES = {
 
 
 class Unavailable(ValueError):
-    """A workload needs something that is not available here."""
+    """A workload needs something that is not available here, or has no case of the given name."""
 
 
 def run(name: str, settings: Settings) -> Record:
     """Runs a workload.
 
     Raises:
-        ValueError: There is no such workload or peer, or no case has `only` in its name.
-        Unavailable: The workload can't run here.
+        ValueError: There is no such workload or peer.
+        Unavailable: The workload can't run here, or no case has `only` in its name.
     """
     from .record import PEERS, Record, noting_other_processes
 
@@ -66,5 +66,5 @@ def run(name: str, settings: Settings) -> Record:
     with noting_other_processes(record):
         getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)(record)
     if not record.rows:
-        raise ValueError(f"bench: no case of {name} has {settings.only!r} in its name")
+        raise Unavailable(f"bench: no case of {name} has {settings.only!r} in its name")
     return record

@@ -54,6 +54,7 @@ class Settings:
     def __post_init__(self) -> None:
         check.integer("bench", "repeats", self.repeats, low=1)
         check.number("bench", "seconds", self.seconds, low=0)
+        check.one_of("bench", "device", self.device.type, ("cpu", "cuda"))
         if self.device.type == "cuda":
             choose_backend("cuda", self.device)
 

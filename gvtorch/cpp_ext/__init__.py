@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import os
+import warnings
 from pathlib import Path
 
 import torch
+
+from .compilers import INSTRUCTION_SETS
 
 FOLDER = Path(__file__).parent / "lib"
 SOURCES = Path(__file__).parent / "csrc"
@@ -22,6 +26,10 @@ def load() -> dict[str, str]:
     """Loads each library once; returns for each backend, `cpp` and `cuda`, an empty text if it can
     be used, else the reason why it can't.
     """
+    limit = os.environ.get("GVTORCH_CPU", "baseline")
+    if limit not in INSTRUCTION_SETS:
+        known = ", ".join(INSTRUCTION_SETS)
+        warnings.warn(f"GVTORCH_CPU={limit!r} means baseline; known are {known}", stacklevel=2)
     reasons = {"cpp": _load("libgvtorch_cpu.so")}
     if reasons["cpp"]:
         reasons["cuda"] = "it needs the C++ library"

@@ -40,8 +40,14 @@ NVCC_FLAGS = (
 
 
 def find_cxx() -> list[str]:
-    """Returns the C++ compiler's command: CXX, which may be several words, or g++."""
-    return shlex.split(os.environ.get("CXX") or "g++")
+    """Returns the C++ compiler's command: CXX, which may be several words, or g++. Raises
+    RuntimeError if CXX has a quote that does not end.
+    """
+    command = os.environ.get("CXX", "").strip() or "g++"
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        raise RuntimeError(f"CXX must be a command, got {command!r}: {error}") from None
 
 
 def find_nvcc() -> str | None:

@@ -40,6 +40,7 @@ from pathlib import Path
 
 import torch
 
+from ..base.messages import one_line
 from ..base.whole_file import cache_folder
 from . import SOURCES, compilers, instructions
 
@@ -76,8 +77,8 @@ class ShaderSource:
             contents[file] = text = file.read_bytes()
             lines = text.decode(errors="replace").replace("\\\r\n", "").replace("\\\n", "")
             for included in _INCLUDE.findall(lines):
-                path = (file.parent / included).resolve()
-                if path.is_file() and path not in contents:
+                path = _existing(file.parent / included)
+                if path is not None and path not in contents:
                     pending.append(path)
         digest = hashlib.sha256(name.encode() + _source_digests())
         for file in sorted(contents):
@@ -86,7 +87,8 @@ class ShaderSource:
         list_path = _library_folder() / f"{name.replace('::', '_')}_{digest.hexdigest()[:16]}.more"
         listed_files = []
         for file in _read_list(list_path):
-            file_digest = hashlib.sha256(file.read_bytes()).digest() if file.is_file() else b"none"
+            is_there = _existing(file) is not None
+            file_digest = hashlib.sha256(file.read_bytes()).digest() if is_there else b"none"
             digest.update(os.fsencode(file) + b"\0" + file_digest)
             listed_files.append((file, file_digest))
         return ShaderSource(
@@ -126,9 +128,9 @@ def load_op(header: str | os.PathLike[str], name: str) -> UserShader:
     """
     if not isinstance(header, (str, os.PathLike)) or "\0" in str(header):
         raise ValueError(f"CompiledShader: header must be a path, got {header!r}")
-    path = Path(header).expanduser().resolve()
-    if not path.is_file():
-        raise ValueError(f"CompiledShader: there is no header {path}")
+    path = _existing(Path(header))
+    if path is None:
+        raise ValueError(f"CompiledShader: there is no header {one_line(header, 200)}")
     if path.name == "user_shader.h":
         raise ValueError(f"CompiledShader: {path} has the name of the header that it includes")
     if b"\0" in path.read_bytes():
@@ -291,7 +293,20 @@ def _read_list(list_path: Path) -> list[Path]:
         entries = json.loads(list_path.read_text())
     except (OSError, ValueError, RecursionError):
         return []
-    return [Path(file) for file in entries] if isinstance(entries, list) else []
+    if not isinstance(entries, list):
+        return []
+    return [Path(file) for file in entries if isinstance(file, str)]
+
+
+def _existing(path: Path) -> Path | None:
+    """Returns the absolute path of a file, without links and `~`; None if there is none, also where
+    the name is too long or the links are a loop.
+    """
+    try:
+        absolute = path.expanduser().resolve()
+        return absolute if absolute.is_file() else None
+    except (OSError, RuntimeError, ValueError):
+        return None
 
 
 def _sweep(folder: Path) -> None:

@@ -59,11 +59,11 @@ def matrices(
         ValueError: The camera is an orbit camera without a position, or not 0 < near < far.
     """
     context = "opengl.matrices"
-    if camera.frame is not Coordinates.WORLD:
+    if check.instance(context, "camera", camera, Camera).frame is not Coordinates.WORLD:
         raise ValueError(f"{context}: an orbit camera has no position yet, call placed(tree.box)")
-    check.number(context, "near", near, low=0, open_low=True)
+    near = check.number(context, "near", near, low=0, open_low=True)
     if far != math.inf:
-        check.number(context, "far", far, low=near, open_low=True)
+        far = check.number(context, "far", far, low=near, open_low=True)
     check.instance(context, "clip_depth", clip_depth, ClipDepth)
     (fx, fy), (cx, cy) = camera.Ks[:, (0, 1), (0, 1)].unbind(1), camera.Ks[:, :2, 2].unbind(1)
     projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
@@ -106,7 +106,7 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
     intrinsics[..., 1, 1] = matrix[..., 1, 1] * height / 2
     intrinsics[..., 1, 2] = (1 + matrix[..., 1, 2]) * height / 2
     intrinsics[..., 2, 2] = 1
-    view = _AXES[:, None] * torch.as_tensor(modelview).detach().to("cpu", torch.float64)
+    view = _AXES[:, None] * check.reals(context, "modelview", modelview)
     return Camera(view, intrinsics, width, height)
 
 
@@ -224,7 +224,7 @@ class _Pixels(NamedTuple):
 
 def _projection(context: str, projection: Tensor) -> tuple[Tensor, bool]:
     """Returns a projection, checked, in float64 on the CPU, and whether it is orthographic."""
-    matrix = torch.as_tensor(projection).detach().to("cpu", torch.float64)
+    matrix = check.reals(context, "projection", projection)
     if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
         raise ValueError(
             f"{context}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
@@ -241,10 +241,10 @@ def _projection(context: str, projection: Tensor) -> tuple[Tensor, bool]:
     zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
     zeros = torch.cat((zeros, p[:, :2, zero_column]), 1)
     depth_scale = p[:, 2, 2 if orthographic else 3]
-    valid = torch.isfinite(p).all() & (zeros == 0).all() & (depth_scale != 0).all()
+    valid = (zeros == 0).all() & (depth_scale != 0).all()
     if not bool(valid & (p[:, 0, 0] > 0).all() & (p[:, 1, 1] > 0).all()):
         raise ValueError(
-            f"{context}: projection must be finite, without skew or rotation, scale x and y by "
+            f"{context}: projection must be without skew or rotation, scale x and y by "
             f"more than 0 and keep depths apart, got {matrix.tolist()}"
         )
     return matrix, orthographic

@@ -91,7 +91,7 @@ def choose_requests(
     priority_2b = torch.zeros((2, batch), dtype=torch.int32, device=node.device)
     for row, kind in enumerate((REQUEST_LOAD, REQUEST_SUBDIVIDE)):
         wanted = order[valid[order] & ((word[order] & kind) != 0)]
-        chosen = wanted[: min(batch, int(room_2[1 - row]))]
+        chosen = wanted[: min(batch, max(0, int(room_2[1 - row])))]
         node_2b[row, : len(chosen)] = node[chosen].to(torch.int64)
         priority_2b[row, : len(chosen)] = size[chosen]
     return node_2b, priority_2b

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..base import check
 from .reference import noise as twin
-from .registry import Backend, uncached_backend
+from .registry import Backend, runs_twin
 
 KINDS = twin.KINDS
 
@@ -45,27 +45,27 @@ def noise(
     Raises:
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
     """
-    context, device = "noise", point_pn.device
+    context = "noise"
+    check.instance(context, "point_pn", point_pn, Tensor)
     n = point_pn.shape[1] if point_pn.dim() == 2 else 0
     if n not in (2, 3) or point_pn.dtype not in (torch.float32, torch.float64):
         got = check.describe(point_pn)
         raise ValueError(f"{context}: point_pn must be (p, 2) or (p, 3) floats, got {got}")
     check.one_of(context, "kind", kind, KINDS)
-    check.integer(context, "seed", seed, low=-(2**63))
+    seed = check.integer(context, "seed", seed, low=-(2**63))
     jitter = check.number(context, "jitter", jitter, low=0, high=1)
-    check.integer(context, "reach", reach, low=1, high=2)
-    if not isinstance(period, Sequence):
+    reach = check.integer(context, "reach", reach, low=1, high=2)
+    if not isinstance(period, Sequence) or len(period) > 3:
         raise ValueError(f"{context}: period must be numbers of cells, one an axis, got {period!r}")
-    x, y, z = (*period, 0, 0, 0)[:3]
-    for axis_period in (x, y, z):
-        check.integer(context, "period", axis_period, low=0, high=2**28)
+    x, y, z = (
+        check.integer(context, "period", cells, low=0, high=2**28)
+        for cells in (*period, 0, 0, 0)[:3]
+    )
     kind_index, arguments = (
         KINDS.index(kind),
         twin.NoiseArguments(twin.salts(seed), (x, y, z), jitter, reach),
     )
-    needs_gradient = torch.is_grad_enabled() and point_pn.requires_grad
-    chosen_backend = uncached_backend(backend, device)
-    if chosen_backend == "reference" or (needs_gradient and backend == "auto"):
+    if runs_twin(backend, point_pn):
         return twin.noise(point_pn, kind_index, arguments)
     scalars = (*(salt & 0xFFFFFFFF for salt in arguments.salt), x, y, z, jitter, reach)
     return torch.ops.gvtorch.noise(point_pn.contiguous(), kind_index, *scalars)

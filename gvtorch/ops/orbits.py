@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..base import check
 from .reference import orbits as twin
-from .registry import Backend, uncached_backend
+from .registry import Backend, runs_twin, uncached_backend
 
 KINDS = ("power", "fold")
 
@@ -29,6 +29,7 @@ class Orbit(NamedTuple):
         """Raises ValueError unless all tensors have the dtype and device of `like` and their
         shapes, and numbers are in range. `fields`: name, tensor and shape of each other argument.
         """
+        check.instance(context, fields[0][0], like, Tensor)
         if like.dtype not in (torch.float32, torch.float64):
             got = check.describe(like)
             raise ValueError(f"{context}: {fields[0][0]} must be float32 or float64, got {got}")
@@ -80,10 +81,7 @@ def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
     """
     orbit.check("orbits", point_p3, [("point_p3", point_p3, "p3")])
     tensors = (point_p3, orbit.constant_3, orbit.bailout_1)
-    needs_gradient = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    if uncached_backend(backend, point_p3.device) == "reference" or (
-        needs_gradient and backend == "auto"
-    ):
+    if runs_twin(backend, *tensors):
         return twin.orbits(point_p3, orbit.twin_orbit())
     return torch.ops.gvtorch.orbits(point_p3, *orbit.arguments())
 

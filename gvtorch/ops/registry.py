@@ -62,6 +62,15 @@ def choose_backend(backend: str, device: torch.device) -> str:
 uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
 
 
+def runs_twin(backend: str, *tensors: Tensor) -> bool:
+    """Returns whether a call runs the twin: as `backend` says or, for auto, where gradients by its
+    tensors are recorded, since torch can differentiate the twin. Raises as `choose_backend` does.
+    """
+    needs_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+    chosen = uncached_backend(backend, tensors[0].device)
+    return chosen == "reference" or (needs_gradient and backend == "auto")
+
+
 def op(extra_check: Callable[..., None] | None = None) -> Callable[[_Twin], _Twin]:
     """Turns a twin into an op: it checks the arguments, then calls the compiled op of the twin's
     name or the twin itself, as the argument `backend` says: auto, reference, cpp or cuda.
@@ -256,8 +265,12 @@ FAKES: dict[str, Callable[..., Any]] = {
 }
 
 
-#: Ops that return floats of inputs that may require a gradient, and have no backward.
-WITHOUT_GRADIENTS = ("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds")
+#: Ops that return floats of inputs that may require a gradient, and have no backward. (Those that
+#: are one themselves would otherwise lose second derivatives.)
+WITHOUT_GRADIENTS = (
+    *("trace_rays", "shade_rays", "noise", "splat", "orbits", "orbit_bounds"),
+    *("sample_bricks_backward", "composite_backward"),
+)
 
 _libraries: dict[str, torch.library.Library] = {}  # kernels last as long as these
 

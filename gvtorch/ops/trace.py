@@ -45,15 +45,14 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
 
 def check_channel(context: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
     """Checks the fields of `TraceArguments.channel`: placement, bricks and constants."""
-    check.integer(context, "branching", arguments.branching, low=2, high=config.MAX_BRANCHING)
+    n = check.integer(context, "branching", arguments.branching, low=2, high=config.MAX_BRANCHING)
     fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
     placement = _fields(arguments, torch.float64, "place_33")
     sizes = check.tensors(context, device, placement + fields)
-    check.integer(context, "max_depth", arguments.max_depth, low=0, high=62)
-    if arguments.branching**arguments.max_depth > config.MOST_NODES:
+    depth = check.integer(context, "max_depth", arguments.max_depth, low=0, high=62)
+    if n**depth > config.MOST_NODES:
         raise ValueError(
-            f"{context}: branching {arguments.branching} and max_depth {arguments.max_depth} make "
-            f"more than 2^50 nodes a side"
+            f"{context}: branching {n} and max_depth {depth} make more than 2^50 nodes a side"
         )
     check.integer(context, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
     check.number(context, "root_voxel", arguments.root_voxel, low=0, open_low=True)

@@ -15,6 +15,7 @@ import torch
 
 from ..base import check
 from ..base.constants import MAX_PICTURE_SIDE
+from ..base.digits import finite_number
 from ..base.records import RenderStats
 from ..base.units import length_unit, metres
 from ..base.volume import Volume, to_numpy
@@ -217,7 +218,9 @@ class _PlaneReader:
         if isinstance(position, str):
             text = position.strip()
             if text.endswith("%"):
-                position = check.number(context, "position", text[:-1], low=0, high=100) / 100
+                percent = finite_number(text[:-1])
+                share = text if percent is None else percent
+                position = check.number(context, "position", share, low=0, high=100) / 100
             elif re.fullmatch(r"[+-]?\d+", text):
                 position = int(text)
             else:

@@ -5,12 +5,11 @@ csrc/shaders/channels.h, which gives the formula and the layout of the table.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from .exact import absorbed_by, clamp, larger
+from .exact import absorbed_by, larger
 from .lit import Lit
 from .march import Piece, Probe, Transfer
 from .tree import ChannelBricks
@@ -29,15 +28,9 @@ class ChannelRows(Transfer):
 
     def __init__(self, transfer: Transfer, head: Sequence[float], first: int) -> None:
         component, self.low, self.scale, rows = head
-        self.component, self.rows = int(component), int(rows)
-        table_rows = slice(first, first + self.rows)
-        self.table_lm4, self.opaque_m = (
-            transfer.table_lm4[:, table_rows],
-            transfer.opaque_m[table_rows],
-        )
-
-    def row_position(self, value: Tensor) -> Tensor:
-        return clamp((value - self.low) * self.scale, 0, self.rows - 1)
+        self.component, self.end = int(component), first + int(rows)
+        self.table_lm4 = transfer.table_lm4[:, first : self.end]
+        self.opaque_m = transfer.opaque_m[first : self.end]
 
 
 class ChannelTable:
@@ -49,7 +42,7 @@ class ChannelTable:
         self.channels, first = [], 1 + count
         for head in heads[1:first].tolist():
             self.channels.append(ChannelRows(transfer, head, first))
-            first += self.channels[-1].rows
+            first = self.channels[-1].end
 
     def transparent(self, low: Tensor, high: Tensor) -> Tensor:
         """Returns (r,) bool: no number shows anything between low and high (r, c)."""
@@ -63,9 +56,9 @@ class ChannelTable:
         total = torch.zeros_like(piece.middle)
         color = total[:, None].expand(-1, 3)
         level = torch.where(piece.odd, 0, piece.level)
+        numbers = probe.numbers(probe.channel, piece.middle)
         for rows in self.channels:
-            component = replace(probe.channel, component=rows.component)
-            row = rows.look_up(probe.number(component, piece.middle), level)
+            row = rows.look_up(numbers[:, rows.component], level)
             halvings = row[:, 3]
             color = color + halvings[:, None] * row[:, :3]
             total = larger(total, halvings) if self.additive else total + halvings

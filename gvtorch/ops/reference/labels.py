@@ -12,7 +12,7 @@ from ..shading import LabelNumbers
 from .exact import clamp, dot, larger, smaller, stretch, unit
 from .lit import Lit
 from .march import Piece, Probe
-from .rays import INF, Beam
+from .rays import INF
 from .tree import ChannelBricks, Holder
 
 _MAX_REACH = 3  # voxels
@@ -30,16 +30,16 @@ class Nearest:
 class LabelBricks(ChannelBricks):
     """One component of a channel of labels."""
 
-    def nearest(self, holder: Holder, beam: Beam, t: Tensor) -> Nearest:
+    def nearest(self, holder: Holder, t: Tensor) -> Nearest:
         """Returns the voxels at distances t (r,)."""
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
-        position = self.positions(holder, beam, t)
+        position = holder.at(t)
         low, high = self.border, side - 1 - self.border
         clamped = clamp(position + 0.5, low, high + 1)
         cell = smaller(torch.floor(clamped), torch.full_like(clamped, high))
         from_center = clamp(position - cell, -0.5, 0.5)
         cell = cell.to(torch.int64)
-        constant = self.constant(holder, real)
+        constant = self.constants(holder, real)[:, self.component]
         value = torch.where(holder.brick >= 0, self.voxel_value(holder, cell, real), constant)
         return Nearest(value, cell, from_center)
 
@@ -56,41 +56,31 @@ class LabelBricks(ChannelBricks):
         other labels: the sum of the offsets to these, each weighted by a tent around the position,
         which ends half a voxel beyond the reach: as many voxels as the border is wide, 1 to 3.
         """
-        value, last = nearest.value, self.bricks_bzyxc.shape[1] - 1
-        reach = max(1, min(_MAX_REACH, self.border))
-        steps = range(-reach, reach + 1)
-        offsets = [k - nearest.from_center for k in steps]
-        weights = [
-            clamp(reach + 0.5 - larger(offset, -offset), 0, INF).unbind(1) for offset in offsets
-        ]
-        moments = [
-            tuple(
-                weight * column
-                for weight, column in zip(axis_weights, offset.unbind(1), strict=True)
-            )
-            for axis_weights, offset in zip(weights, offsets, strict=True)
-        ]
-        zero = torch.zeros_like(value)
-        x, y, z = zero, zero, zero
-        for k in steps:
-            plane, along_x, along_y = zero, zero, zero
-            for j in steps:
-                row, along = zero, zero
-                for i in steps:
-                    neighbour = (nearest.cell + torch.tensor((i, j, k)).to(nearest.cell)).clamp(
-                        0, last
-                    )
-                    voxel_label = self.voxel_value(holder, neighbour, value.dtype)
-                    differs = (voxel_label != value).to(value)
-                    row = row + weights[i + reach][0] * differs
-                    along = along + moments[i + reach][0] * differs
-                plane = plane + weights[j + reach][1] * row
-                along_x = along_x + weights[j + reach][1] * along
-                along_y = along_y + moments[j + reach][1] * row
-            x = x + weights[k + reach][2] * along_x
-            y = y + weights[k + reach][2] * along_y
-            z = z + moments[k + reach][2] * plane
-        return torch.stack((x, y, z), 1)
+        reach, last = max(1, min(_MAX_REACH, self.border)), self.bricks_bzyxc.shape[1] - 1
+        if self.bricks_bzyxc.shape[0] == 0:
+            return torch.zeros_like(nearest.from_center)
+        steps = torch.arange(-reach, reach + 1, device=nearest.cell.device)
+        x, y, z = (nearest.cell[:, :, None] + steps).clamp(0, last).unbind(1)  # (r, step) each
+        voxels = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
+        brick = holder.brick.clamp(min=0)[:, None, None, None]
+        label_rzyx = self.bricks_bzyxc[(brick, *voxels, self.component)].to(nearest.value)
+        differs = (label_rzyx != nearest.value[:, None, None, None]).to(nearest.value)
+
+        offset = steps - nearest.from_center[:, :, None]  # (r, axis, step)
+        weight = clamp(reach + 0.5 - larger(offset, -offset), 0, INF)
+        (wx, wy, wz), (mx, my, mz) = weight.unbind(1), (weight * offset).unbind(1)
+        row, row_x = _weighted(differs, wx), _weighted(differs, mx)  # (r, z, y)
+        plane, plane_x, plane_y = _weighted(row, wy), _weighted(row_x, wy), _weighted(row, my)
+        sums = _weighted(plane_x, wz), _weighted(plane_y, wz), _weighted(plane, mz)
+        return torch.stack(sums, 1)
+
+
+def _weighted(values: Tensor, weight: Tensor) -> Tensor:
+    """Returns (r, ...) the sums of values (r, ..., step) times weights (r, step), one by one."""
+    total = torch.zeros_like(values[..., 0])
+    for value, column in zip(values.unbind(-1), weight.unbind(1), strict=True):
+        total = total + column.view(-1, *[1] * (total.dim() - 1)) * value
+    return total
 
 
 class Labels(Lit):
@@ -110,7 +100,7 @@ class Labels(Lit):
         color, alpha, normal = blended.split((3, 1, 3), 1)
         hidden = ~(self.contribution(piece, probe, fine)[:, 3] > 0)
         holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
-        label = self.row_of(self.channel.nearest(holder, probe.beam, piece.middle).value)
+        label = self.row_of(self.channel.nearest(holder, piece.middle).value)
         clear_after, clear, hit_clear = (
             self.sum.clear * (1 - alpha[:, 0]),
             self.sum.clear,
@@ -133,7 +123,7 @@ class Labels(Lit):
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
         t, table = piece.middle, self.transfer.table_lm4
-        nearest = self.channel.nearest(holder, probe.beam, t)
+        nearest = self.channel.nearest(holder, t)
         level = torch.where(piece.odd, 0, piece.level)
         color, alpha = table[level, self.row_of(nearest.value)].split((3, 1), 1)
         stretched = stretch(alpha[:, 0], piece.lengths)[:, None]

@@ -17,7 +17,7 @@ from torch import Tensor
 from ..shading import FAINT, LightKind, ShadeParameters
 from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
 from .march import Piece, Plain, Probe, Visitor, Walk
-from .rays import INF, Intervals, split
+from .rays import INF, Intervals, rounded
 from .tree import ChannelBricks
 
 #: Factors from one octave of scattering to the next, of its light and of its directedness; fitted
@@ -30,7 +30,7 @@ class Light:
     """A light, the lit material and the eye. World units."""
 
     parameters: ShadeParameters
-    normals: tuple[ChannelBricks, ...]  # three components, or none
+    normals: ChannelBricks | None  # stored ones
     eye: Tensor  # (r, 3) position
     direction: Tensor  # (r, 3) direction of the rays
     moved: Tensor  # (r,) distance from the eye to where distances t begin
@@ -45,9 +45,9 @@ class Light:
         """Returns (r, 3) normals towards the eye, stored or the gradient's; 0 where none exists."""
         if self.scatters:
             return torch.zeros_like(self.direction)
-        if self.normals:
-            p, components = self.parameters, [probe.number(c, t) for c in self.normals]
-            normal = torch.stack(components, 1) * p.normal_scale + p.normal_offset
+        if self.normals is not None:
+            p = self.parameters
+            normal = probe.numbers(self.normals, t) * p.normal_scale + p.normal_offset
         else:
             normal = probe.gradient(t, self.cube)
         return self.to_eye(normal)
@@ -216,11 +216,11 @@ class Shadows:
             direction[ray_index],
             self.walk.intervals.beam[ray_index],
         )
-        origin, rest = split(eye_beam.along(t), eye_beam.deep, t.dtype)
+        origin, exact_origin = rounded(eye_beam.along(t), eye_beam.scene.deep, t.dtype)
         beam = replace(
             eye_beam,
             origin=origin,
-            rest=rest,
+            exact_origin=exact_origin,
             direction=direction / self.cube,
             cone_near=eye_beam.cone(t),
             cone_growth=growth[ray_index] * self.cone_scale,

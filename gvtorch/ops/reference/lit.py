@@ -20,8 +20,7 @@ class Lit(Plain):
     """The lit transfer function, and the base of all fused shaders."""
 
     light: Light
-    others: tuple[ChannelBricks, ...]  # components of the second channel, or none
-    other_component: int
+    other: ChannelBricks | None  # the second channel
     features: Tensor  # (r, c) sums
     shadows: Shadows | None
     bricks: ClassVar[type[ChannelBricks]] = ChannelBricks  # how it reads its channel
@@ -32,10 +31,12 @@ class Lit(Plain):
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
         """As `Visitor.same`; false for shadows, and for stored normals with a point light."""
         same = torch.ones_like(fine, dtype=torch.bool)
-        for channel in (self.channel, *self.light.normals[:1], *self.others[:1]):
-            numbers = channel.constant_nc
-            same = same & (numbers[fine] == numbers[coarse]).all(1)
-        varies = self.light.parameters.light_kind == LightKind.POINT and bool(self.light.normals)
+        for channel in (self.channel, self.light.normals, self.other):
+            if channel is not None:
+                numbers = channel.constant_nc
+                same = same & (numbers[fine] == numbers[coarse]).all(1)
+        has_normals = self.light.normals is not None
+        varies = self.light.parameters.light_kind == LightKind.POINT and has_normals
         return (same | (fine == coarse)) & (self.shadows is None) & (not varies)
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:

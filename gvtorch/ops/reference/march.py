@@ -55,9 +55,8 @@ class Visit(NodePair):
         """Returns the visit of rays that have not looked up any node yet."""
         zero, false = torch.zeros_like(like), torch.zeros_like(like, dtype=torch.bool)
         zero_index = zero.to(torch.int64)
-        holder = Holder(
-            zero_index, zero_index, zero_index, torch.stack((zero,) * 3, 1).double(), zero
-        )
+        zeros = torch.stack((zero,) * 3, 1)
+        holder = Holder(zero_index, zero_index, zero_index, zero, zeros, zeros)
         return cls(holder, holder, zero, zero, zero, zero_index, false, zero, false, false)
 
     def stays(self, intervals: Intervals) -> Tensor:
@@ -82,9 +81,13 @@ class Probe:
         """Returns (r,) values at distances t (r,)."""
         return self.number(self.channel, t)
 
-    def number(self, bricks: ChannelBricks, t: Tensor) -> Tensor:
-        """Returns (r,) numbers of any channel at distances t (r,)."""
-        return self.blend(t, lambda holder: bricks.sample(holder, self.beam, t))
+    def number(self, channel: ChannelBricks, t: Tensor) -> Tensor:
+        """Returns (r,) numbers of any channel at distances t (r,): its component."""
+        return self.blend(t, lambda holder: channel.sample(holder, t))
+
+    def numbers(self, channel: ChannelBricks, t: Tensor) -> Tensor:
+        """Returns (r, c) all numbers of any channel at distances t (r,)."""
+        return self.blend(t, lambda holder: channel.samples(holder, t))
 
     def gradient(self, t: Tensor, cube: Tensor) -> Tensor:
         """Returns (r, 3) gradients per world unit, over one voxel; `cube` (3,): root cube size."""
@@ -92,12 +95,9 @@ class Probe:
 
     def slope(self, holder: Holder, t: Tensor, cube: Tensor) -> Tensor:
         """Returns (r, 3) gradients from one of the nodes; see `gradient`."""
-        slopes = []
-        for axis in range(3):
-            shifts = [[offset if a == axis else 0.0 for a in range(3)] for offset in (-0.5, 0.5)]
-            low, high = (self.channel.sample(holder, self.beam, t, shift) for shift in shifts)
-            slopes.append((high - low) * (holder.scale / cube[axis]))
-        return torch.stack(slopes, 1)
+        half = 0.5 * torch.eye(3).to(t)[:, None]  # (axis, 1, 3) voxels along each axis
+        low, high = self.channel.sample(holder, t, torch.stack((-half, half)))  # (axis, r)
+        return ((high - low) * (holder.scale / cube[:, None])).mT
 
     def blend(self, t: Tensor, read: Callable[[Holder], Tensor]) -> Tensor:
         """Returns (r,) or (r, c): `read` of the fine node, blended with `read` of the coarse one,
@@ -175,12 +175,14 @@ class Transfer:
 
     def __init__(self, args: TraceArguments) -> None:
         self.table_lm4, self.domain_2, self.opaque_m = args.table_lm4, args.domain_2, args.opaque_m
+        self.low: Tensor | float
+        self.scale: Tensor | float  # rows a value
+        self.low, high = self.domain_2.unbind(0)
+        self.scale = divide(len(self.opaque_m) - 1, high - self.low, high)
 
     def row_position(self, value: Tensor) -> Tensor:
         """Returns (r,) fractional rows of values."""
-        low, high = self.domain_2.unbind(0)
-        last = len(self.opaque_m) - 1
-        return clamp((value - low) * divide(last, high - low, high), 0, last)
+        return clamp((value - self.low) * self.scale, 0, len(self.opaque_m) - 1)
 
     def cell(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r,) int64 rows at or before values, and (r,) weights of the next rows."""
@@ -196,7 +198,10 @@ class Transfer:
 
     def interval(self, value: Tensor, piece: Piece) -> Tensor:
         """Returns (r, 4) linear RGB and the alpha of an interval of one value."""
-        odd_rgba, whole_rgba = self.look_up(value), self.look_up(value, piece.level)
+        whole_rgba = self.look_up(value, piece.level)
+        if not piece.odd.any():
+            return whole_rgba
+        odd_rgba = self.look_up(value)
         alpha = stretch(odd_rgba[:, 3], piece.lengths)[:, None]
         odd_rgba = torch.cat((odd_rgba[:, :3], alpha), 1)
         return torch.where(piece.odd[:, None], odd_rgba, whole_rgba)
@@ -287,7 +292,8 @@ class Walk:
             moving = active
             while moving.any():
                 intervals.next(moving)
-                moving = one_step & visit.stays(intervals)
+                stays = visit.stays(intervals)
+                moving = one_step & stays
             end = smaller(intervals.start, intervals.beam.last)
             length = torch.where(odd, end - start, length)
             middle = torch.where(visit.uniform, start + length * 0.5, middle)
@@ -296,7 +302,7 @@ class Walk:
             sampled = active & ~visit.invisible
             self.samples = self.samples + sampled.to(torch.int32)
             visitor.add(piece, Probe(intervals.beam, visit, self.channel), sampled)
-            leaving = one_step | ~visit.stays(intervals)
+            leaving = one_step | ~stays
             active = intervals.inside() & visitor.goes_on(leaving)
 
     def look_up(self, ray_index: Tensor, t: Tensor, visitor: Visitor) -> None:
@@ -304,21 +310,21 @@ class Walk:
         what is absent.
         """
         tree, beam, t = self.tree, self.intervals.beam[ray_index], t[ray_index]
-        cone, position = beam.cone(t), beam.at(t)
+        cone, finest = beam.cone(t), tree.levels.finest_cells(beam.at(t))
         wanted = tree.levels.wanted(cone)
         voxel, voxel_above = tree.levels.voxels(wanted)
 
         def hides(node: Tensor) -> Tensor:
             return visitor.hides(ray_index, *self.channel.value_range(node, t.dtype))
 
-        descent = tree.descend(position, wanted, hides)
+        descent = tree.descend(finest, wanted, hides)
         voxel_fits = voxel <= cone
         blends = voxel_fits & (wanted > 0)
         only_fine = ~blends | (descent.coarse < 0)
-        fine = tree.holder(descent.fine, descent.fine_depth, position)
+        fine = tree.holder(descent.fine, descent.fine_depth, finest, beam)
         coarse_node = torch.where(only_fine, descent.fine, descent.coarse)
         coarse_depth = torch.where(only_fine, descent.fine_depth, descent.coarse_depth)
-        coarse = tree.holder(coarse_node, coarse_depth, position)
+        coarse = tree.holder(coarse_node, coarse_depth, finest, beam)
         hidden = descent.hidden & ((descent.depth < wanted) | ~blends)
         tree.stamp(torch.cat((fine.brick[~hidden], coarse.brick[~hidden])))
         missed = tree.mark(descent, wanted, blends, cone, ~hidden)
@@ -327,7 +333,7 @@ class Walk:
         invisible = hidden | (descent.fine < 0) | (empty & (not visitor.sees_empty))
         same = visitor.same(fine.node.clamp(min=0), coarse.node.clamp(min=0))
         uniform = ~invisible & (fine.brick < 0) & (coarse.brick < 0) & same
-        exit_t = beam.leave(*tree.levels.corners(position, descent.depth))
+        exit_t = beam.leave(*tree.levels.corners(finest, descent.depth))
         visit = Visit(
             fine, coarse, voxel, voxel_above, t, wanted, voxel_fits, exit_t, invisible, uniform
         )

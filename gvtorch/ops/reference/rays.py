@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -18,11 +18,12 @@ INF = math.inf
 
 @dataclass
 class Rows:
-    """Base of dataclasses whose tensors all have one row per ray."""
+    """Base of dataclasses whose tensors, but not those in other records, have one row per ray."""
 
     def __getitem__(self, index: Tensor) -> Self:
         """Returns the rows of some rays."""
-        return replace(self, **{name: field[index] for name, field in vars(self).items()})
+        rows = {n: f[index] for n, f in vars(self).items() if isinstance(f, (Tensor, Rows))}
+        return replace(self, **rows)
 
     def index_put(self, index: tuple[Tensor], rows: Self) -> Self:
         """Returns a copy with the rows of some rays replaced."""
@@ -32,15 +33,22 @@ class Rows:
         )
 
 
+class SceneBox(NamedTuple):
+    """The part of the root cube that holds the scene, in tree units; its low corner is 0."""
+
+    high: Tensor  # (3,) float64 corner
+    last: Tensor  # (3,) float64 largest coordinates of positions inside
+    deep: bool  # see `is_deep`
+
+
 @dataclass
 class Beam(Rows):
     """Rays in tree units that start where they enter the scene; distances stay world lengths."""
 
+    scene: SceneBox
     origin: Tensor  # (r, 3)
-    rest: Tensor  # (r, 3) rounding error of the origin where the tree is deep, else 0
-    deep: Tensor  # (r,) bool, see `is_deep`
+    exact_origin: Tensor  # (r, 3) float64; more exact than `origin` only where the tree is deep
     direction: Tensor  # (r, 3)
-    high: Tensor  # (r, 3) float64 corner of the scene; its low corner is 0
     cone_near: Tensor  # (r,)
     cone_growth: Tensor  # (r,)
     first: Tensor  # (r,)
@@ -60,7 +68,9 @@ class Beam(Rows):
             entry = torch.where(direction[:, axis] != 0, axis_entry, entry)
         moved = torch.where((entry > 0) & (entry < INF), entry, 0.0)
         near_cone, growth = (rays.cone_r2 * args.cone_scale).unbind(1)
-        deep = torch.full_like(moved, is_deep(args), dtype=torch.bool)
+        high_real, deep = high.to(real), is_deep(args)
+        last_real = (high_real * torch.tensor(0.9999999).to(high_real)).double()
+        scene = SceneBox(high, high * (1 - 2.0**-50) if deep else last_real, deep)
         columns = (
             direction,
             near_cone + growth * moved,
@@ -70,29 +80,23 @@ class Beam(Rows):
             moved,
         )
         real_direction, *numbers = (column.to(real) for column in columns)
-        start = split(origin + moved[:, None] * direction, deep, real)
-        return cls(*start, deep, real_direction, high.expand_as(origin), *numbers).clipped()
-
-    @property
-    def exact_origin(self) -> Tensor:
-        """(r, 3) float64 positions where the rays begin."""
-        return self.origin.double() + self.rest.double()
+        start = rounded(origin + moved[:, None] * direction, deep, real)
+        return cls(scene, *start, real_direction, *numbers).clipped()
 
     def clipped(self) -> Beam:
         """Returns the rays with distances clipped to the scene (slab test, Kay and Kajiya, 1986). A
         ray that no face bounds, or whose cone is NaN, gets an empty range.
         """
-        first, last = self.first, self.last
-        for axis in range(3):
-            columns = (self.exact_origin, self.direction, self.high)
-            position, direction, high = (column[:, axis] for column in columns)
-            to_high = (high - position).to(direction)
-            a, b = -self.origin[:, axis] / direction, to_high / direction
-            parallel = direction == 0
-            outside = parallel & ~((position >= 0) & (position <= high))
+        first, last, direction = self.first, self.last, self.direction
+        position, high = self.exact_origin, self.scene.high
+        a, b = -self.origin / direction, (high - position).to(direction) / direction
+        parallel_r3 = direction == 0
+        outside_r3 = parallel_r3 & ~((position >= 0) & (position <= high))
+        columns_r3 = (smaller(a, b), larger(a, b), parallel_r3, outside_r3)
+        for near, far, parallel, outside in zip(*(c.unbind(1) for c in columns_r3), strict=True):
             last = torch.where(outside, first, last)
-            first = torch.where(parallel, first, larger(first, smaller(a, b)))
-            last = torch.where(parallel, last, smaller(last, larger(a, b)))
+            first = torch.where(parallel, first, larger(first, near))
+            last = torch.where(parallel, last, smaller(last, far))
         is_cone = (self.cone_near == self.cone_near) & (self.cone_growth == self.cone_growth)
         return replace(self, first=first, last=torch.where(is_cone & (last < INF), last, first))
 
@@ -102,16 +106,13 @@ class Beam(Rows):
 
     def along(self, t: Tensor) -> Tensor:
         """Returns (r, 3) float64 positions at distances t (r,), computed in float64 if deep."""
-        rounded = (self.origin + t[:, None] * self.direction).double()
-        exact = self.exact_origin + t[:, None].double() * self.direction.double()
-        return torch.where(self.deep[:, None], exact, rounded)
+        if self.scene.deep:
+            return self.exact_origin + t[:, None].double() * self.direction.double()
+        return (self.origin + t[:, None] * self.direction).double()
 
     def at(self, t: Tensor) -> Tensor:
         """Returns the positions of `along`, clamped into the scene; its high faces belong to it."""
-        high = self.high.to(self.origin)
-        upper_bound = (high * torch.tensor(0.9999999).to(high)).double()
-        upper_bound = torch.where(self.deep[:, None], self.high * (1 - 2.0**-50), upper_bound)
-        return clamp(self.along(t), 0, upper_bound)
+        return clamp(self.along(t), 0, self.scene.last)
 
     def leave(self, low: Tensor, high: Tensor) -> Tensor:
         """Returns (r,) distances at which rays leave float64 boxes; +inf for a direction of 0."""
@@ -131,13 +132,13 @@ def is_deep(args: TraceArguments) -> bool:
     return not is_power or brick_size * args.branching**args.max_depth > DEEP_VOXELS
 
 
-def split(position: Tensor, deep: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Splits float64 positions (r, 3) into numbers of dtype `real` and their rounding errors, which
-    are 0 unless `deep` (r,).
+def rounded(position: Tensor, deep: bool, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Rounds float64 positions (r, 3) to numbers of dtype `real`, and also, if `deep`, to sums of
+    two such numbers: the rounded ones and what rounding took away. Returns both, sums in float64.
     """
     origin = position.to(real)
-    rest = torch.where(deep[:, None], position - origin.double(), 0)
-    return origin, rest.to(real)
+    exact = origin.double()
+    return origin, exact + (position - exact).to(real).double() if deep else exact
 
 
 class Intervals:
@@ -181,21 +182,18 @@ class Intervals:
         self._choose_level(mask)
 
     def _choose_level(self, mask: Tensor) -> None:
-        width = self.beam.cone(self.start)
-        top = len(self.length_l) - 1
-        not_shortest, not_longest = self.level > 0, self.level < top
-        fits = (~not_shortest | ~(width < self.length)) & (
-            ~not_longest | ~(width >= self.length + self.length)
-        )
-        level = (width[:, None] >= self.length_l[1:]).sum(1)
+        width, top = self.beam.cone(self.start), len(self.length_l) - 1
+        too_long = (self.level > 0) & (width < self.length)
+        too_short = (self.level < top) & (width >= self.length + self.length)
         full = self.count >= MAX_INTERVALS  # as many as are counted from one base
-        self.start = torch.where(
-            mask & full & ~(self.start > self.base), self.beam.last, self.start
-        )
-        changes = mask & (full | ~fits)
-        self.base = torch.where(changes, self.start, self.base)
-        self.count = torch.where(changes, 0.0, self.count)
-        self.level = torch.where(changes, level, self.level)
+        changes = mask & (full | too_long | too_short)
+        if changes.any():
+            stuck = changes & full & ~(self.start > self.base)
+            self.start = torch.where(stuck, self.beam.last, self.start)
+            self.base = torch.where(changes, self.start, self.base)
+            self.count = torch.where(changes, 0.0, self.count)
+            level = (width[:, None] >= self.length_l[1:]).sum(1)
+            self.level = torch.where(changes, level, self.level)
         self._update()
 
     def _update(self) -> None:

@@ -120,16 +120,15 @@ def sample_bricks(
 
     node_fields = (segments.node, segments.brick, segments.depth)
     nodes, bricks, depths = (field.to(torch.int64)[segment].unbind(1) for field in node_fields)
-    levels, position = Levels(args, real), beam.at(lookup_t)
+    levels = Levels(args, real)
+    finest = levels.finest_cells(beam.at(lookup_t))
     fine, coarse = (
-        levels.holder(node, brick, depth, position)
+        levels.holder(node, brick, depth, finest, beam)
         for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)
     )
     channel = ChannelBricks.of(args)
     probe = Probe(beam, NodePair(fine, coarse, *levels.voxels(depths[2])), channel)
-    components = channel.components(args.bricks_bzyxc, args.constant_tnc)
-    values = torch.stack([probe.number(component, t) for component in components], 1)
-    return torch.where(valid[:, None], values, 0.0)
+    return torch.where(valid[:, None], probe.numbers(channel, t), 0.0)
 
 
 def composite(

@@ -132,12 +132,12 @@ class Isosurface(Lit):
     def color_at(self, probe: Probe, t: Tensor) -> Tensor:
         """Returns (r, 3) base colours of the surface at distances t (r,)."""
         if self.numbers.scale > 0:
-            components = [probe.number(self.others[i], t) for i in range(4)]
-            rgba = torch.stack(components, 1) * self.numbers.scale
+            assert self.other is not None  # a scale is given with its channel
+            rgba = probe.numbers(self.other, t)[:, :4] * self.numbers.scale
             has_opacity = (rgba[:, 3:] > 0) & (self.numbers.premultiplied > 0)
             return rgba[:, :3] / torch.where(has_opacity, rgba[:, 3:], 1.0)
-        if self.others:
-            return self.transfer.look_up(probe.number(self.others[self.other_component], t))[:, :3]
+        if self.other is not None:
+            return self.transfer.look_up(probe.number(self.other, t))[:, :3]
         return self.transfer.look_up(self.level.expand_as(t))[:, :3]
 
 
@@ -189,7 +189,8 @@ class Features(Lit):
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         rgba = self.rgba(piece, probe)
         share = torch.where(mask, self.sum.clear * rgba[:, 3], 0.0)
-        numbers = torch.stack([probe.number(channel, piece.middle) for channel in self.others], 1)
+        assert self.other is not None  # `ops.trace.check_shade` requires it
+        numbers = probe.numbers(self.other, piece.middle)
         self.features = self.features + share[:, None] * numbers
         self.sum.add(rgba, piece, mask)
 
@@ -235,14 +236,14 @@ def shade_rays(
     columns = (rays.origin_r3, rays.direction_r3, beam.moved, arguments.place_33[1])
     light = Light(
         ShadeParameters.read(parameter_54),
-        channel.components(shading.normal_bzyxc, shading.normal_tnc),
+        channel.other(shading.normal_bzyxc, shading.normal_tnc, 0),
         *(column.to(beam.first) for column in columns),
     )
     shadows = Shadows(walk, light.cube, arguments.cone_scale)
-    others = channel.components(shading.other_bzyxc, shading.other_tnc)
+    other = channel.other(shading.other_bzyxc, shading.other_tnc, shading.other_component)
     features = beam.first.new_zeros((len(beam.first), shading.features))
     shader = twin.begin(
-        *(rays, arguments, walk, light, others, shading.other_component, features),
+        *(rays, arguments, walk, light, other, features),
         shadows if facts.shadows else None,
     )
     walk.go(shader)

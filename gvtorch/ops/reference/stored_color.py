@@ -4,7 +4,6 @@ csrc/shaders/stored_color.h and, lit, in shaders.h.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -40,12 +39,8 @@ class StoredColor(Lit):
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         numbers = self.numbers
-        opacity = self.opacity(piece, probe, self.light.direction)
+        color, opacity = self.seen(piece, probe, self.light.direction)
         shown = mask & (opacity > 0)
-        components = [
-            self.seen_number(probe, i, piece.middle, self.light.direction) for i in range(3)
-        ]
-        color = torch.stack(components, 1) * numbers.scale
         divisor = torch.where((numbers.premultiplied > 0) & shown, opacity, 1.0)
         alpha = stretch(opacity, piece.length / numbers.reference)
         rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
@@ -55,26 +50,22 @@ class StoredColor(Lit):
             self.sum.add(rgba, piece, shown)
 
     def alpha(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
-        return stretch(self.opacity(piece, probe, direction), piece.length / self.numbers.reference)
+        _, opacity = self.seen(piece, probe, direction)
+        return stretch(opacity, piece.length / self.numbers.reference)
 
-    def opacity(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
-        """Returns (r,) opacity per reference length."""
-        return clamp(self.seen_number(probe, 3, piece.middle, direction) * self.numbers.scale, 0, 1)
-
-    def seen_number(self, probe: Probe, number: int, t: Tensor, direction: Tensor) -> Tensor:
-        """Returns (r,) one of the four numbers as seen along rays (r, 3), for which three of the
-        directions are mixed where the channel holds six.
+    def seen(self, piece: Piece, probe: Probe, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns colours (r, 3) as stored, and opacities per reference length (r,), both scaled
+        and as seen along rays `direction` (r, 3).
         """
-
-        def read(component: int) -> Tensor:
-            return probe.number(replace(self.channel, component=component), t)
-
-        width = self.channel.bricks_bzyxc.shape[4]
-        return _by_direction(direction, width, number, read, COLOR_WIDTH)
+        stored = probe.numbers(self.channel, piece.middle)
+        rgba = _by_direction(direction, stored, COLOR_WIDTH) * self.numbers.scale
+        return rgba[:, :3], clamp(rgba[:, 3], 0, 1)
 
 
 class Filtered(Lit):
     """The transfer function, and filtered colours where bricks have them (in coarse slots)."""
+
+    color_width = COLOR_WIDTH
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         fine, coarse = probe.nodes.fine, probe.nodes.coarse
@@ -98,39 +89,37 @@ class Filtered(Lit):
 
     def has_colors(self, holder: Holder) -> Tensor:
         """Returns (r,) bool: the node's brick has colours."""
-        bricks = self.others[0].bricks_bzyxc if self.others else self.channel.bricks_bzyxc[:0]
-        return (holder.brick >= 0) & (holder.brick < len(bricks))
+        colored = 0 if self.other is None else len(self.other.bricks_bzyxc)
+        return (holder.brick >= 0) & (holder.brick < colored)
 
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 4) premultiplied colours and alphas of intervals, from one of the nodes."""
         row = self.function_row(piece, probe, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
-        read = self.reader(piece, probe, holder)
-        color, alpha, scale = self.seen_colors(COLOR_WIDTH, read, piece, holder)
-        colors = torch.stack([*(component * scale for component in color[:3]), alpha], 1)
+        color, alpha, scale = self.seen_colors(self.stored_numbers(piece, holder), piece, holder)
+        colors = torch.cat((color[:, :3] * scale[:, None], alpha[:, None]), 1)
         colors = torch.where((scale > 0)[:, None], colors, 0.0)
         return torch.where(self.has_colors(holder)[:, None], colors, row)
 
     def function_row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 4) the transfer function's rows for one node's values."""
-        value = self.channel.sample(holder, probe.beam, piece.middle)
+        value = self.channel.sample(holder, piece.middle)
         return self.transfer.interval(value, piece)
 
-    def reader(self, piece: Piece, probe: Probe, holder: Holder) -> Callable[[int], Tensor]:
-        """Returns a function that reads one number (r,) of a node's filtered colours."""
+    def stored_numbers(self, piece: Piece, holder: Holder) -> Tensor:
+        """Returns (r, c) all numbers of a node's filtered colours; 0 where it has none."""
+        assert self.other is not None  # else no node has colours
         brick = torch.where(self.has_colors(holder), holder.brick, EMPTY)
-        colored = replace(holder, brick=brick)
-        return lambda number: self.others[number].sample(colored, probe.beam, piece.middle)
+        return self.other.samples(replace(holder, brick=brick), piece.middle)
 
     def seen_colors(
-        self, color_width: int, read: Callable[[int], Tensor], piece: Piece, holder: Holder
-    ) -> tuple[list[Tensor], Tensor, Tensor]:
-        """Returns colour and alpha (r,) of a node's voxels as rays see them; alphas (r,) of
-        intervals; and their ratios to the voxels' alphas.
+        self, stored: Tensor, piece: Piece, holder: Holder
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns colour and alpha (r, 4) of a node's voxels as rays see them; alphas (r,) of
+        intervals; and their ratios to the voxels' alphas. `stored`: `stored_numbers`.
         """
-        width = len(self.others)
-        color = [_by_direction(self.light.direction, width, i, read, color_width) for i in range(4)]
-        stored_alpha = clamp(color[3], 0, 1)
+        color = _by_direction(self.light.direction, stored, self.color_width)[:, :COLOR_WIDTH]
+        stored_alpha = clamp(color[:, 3], 0, 1)
         side = self.light.parameters.own_as(FilteredNumbers).side
         alpha = stretch(stored_alpha, piece.length * holder.scale / side)
         scale = alpha / torch.where(stored_alpha > 0, stored_alpha, 1.0)
@@ -139,6 +128,8 @@ class Filtered(Lit):
 
 class FilteredLit(Filtered):
     """The lit transfer function, and filtered colours with moments of normals."""
+
+    color_width = LIT_COLOR_WIDTH
 
     def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         self.lit(self.rgba(piece, probe), piece, probe, mask)
@@ -158,31 +149,28 @@ class FilteredLit(Filtered):
         by_function = torch.cat((color * alpha, alpha, normal * alpha), 1)
         by_function = torch.where(alpha > 0, by_function, 0.0)
 
-        read = self.reader(piece, probe, holder)
-        color_alpha, interval_alpha, scale = self.seen_colors(LIT_COLOR_WIDTH, read, piece, holder)
+        stored = self.stored_numbers(piece, holder)
+        color_alpha, interval_alpha, scale = self.seen_colors(stored, piece, holder)
         shown, alpha = (scale > 0)[:, None], interval_alpha[:, None]
-        stored_alpha = torch.where(scale > 0, clamp(color_alpha[3], 0, 1), 1.0)[:, None]
-        moments, front = self.moments(read)
+        stored_alpha = torch.where(scale > 0, clamp(color_alpha[:, 3], 0, 1), 1.0)[:, None]
+        moments, front = self.moments(stored)
         front = None if front is None else front / stored_alpha
-        base = torch.stack(color_alpha[:3], 1) / stored_alpha
+        base = color_alpha[:, :3] / stored_alpha
         color, normal = light.shade_rough(base, moments / stored_alpha, front, t)
         by_colors = torch.cat((color * alpha, alpha, unit(normal) * alpha), 1)
         by_colors = torch.where(shown, by_colors, 0.0)
         return torch.where(self.has_colors(holder)[:, None], by_colors, by_function)
 
-    def moments(self, read: Callable[[int], Tensor]) -> tuple[Tensor, Tensor | None]:
+    def moments(self, stored: Tensor) -> tuple[Tensor, Tensor | None]:
         """Returns (r, 6) moments of the normals that rays see, and, if six directions are stored,
         (r, 3) their mean, each normal turned to the side from which its direction sees it.
         """
-        if len(self.others) == LIT_COLOR_WIDTH:
-            return torch.stack([read(i) for i in range(COLOR_WIDTH, LIT_COLOR_WIDTH)], 1), None
+        if stored.shape[1] == LIT_COLOR_WIDTH:
+            return stored[:, COLOR_WIDTH:], None
         mean = front = torch.zeros_like(self.light.direction[:, :1])
+        sides = _facing_sides(self.light.direction, stored, LIT_COLOR_WIDTH)
         for axis, d in enumerate(self.light.direction.unbind(1)):
-            against, first = d < 0, 2 * axis * LIT_COLOR_WIDTH
-            m = [
-                torch.where(against, read(first + LIT_COLOR_WIDTH + i), read(first + i))
-                for i in range(COLOR_WIDTH, LIT_COLOR_WIDTH)
-            ]
+            against, m = d < 0, sides[axis][:, COLOR_WIDTH:].unbind(1)
             column = [m[i] for i in ((0, 1, 2), (1, 3, 4), (2, 4, 5))[axis]]
             weight, total, axial = d * d, m[0] + m[3] + m[5], column[axis]
             valid = (total > 0) & (axial > 0)
@@ -195,17 +183,21 @@ class FilteredLit(Filtered):
         return mean, front
 
 
-def _by_direction(
-    direction: Tensor, width: int, number: int, read: Callable[[int], Tensor], color_width: int
-) -> Tensor:
-    """Returns (r,) one of the numbers of a voxel as seen along rays (r, 3); `read` reads one. Where
-    a channel's `width` is six times that of a colour, three of the directions are mixed.
+def _by_direction(direction: Tensor, stored: Tensor, color_width: int) -> Tensor:
+    """Returns (r, color_width) numbers of voxels as seen along rays (r, 3). Where voxels hold six
+    times as many, those for three of the six directions are mixed.
     """
-    if width == color_width:
-        return read(number)
-    side = []
-    for axis, d in enumerate(direction.unbind(1)):
-        positive = 2 * axis * color_width + number
-        side.append(torch.where(d < 0, read(positive + color_width), read(positive)))
-    x, y, _ = (direction * direction).unbind(1)
+    if stored.shape[1] == color_width:
+        return stored
+    side = _facing_sides(direction, stored, color_width)
+    x, y, _ = (direction * direction)[:, :, None].unbind(1)
     return side[2] + x * (side[0] - side[2]) + y * (side[1] - side[2])
+
+
+def _facing_sides(direction: Tensor, stored: Tensor, color_width: int) -> tuple[Tensor, ...]:
+    """Returns for x, y and z the numbers (r, color_width) of the direction, positive or negative,
+    that a ray (r, 3) follows, of the six that voxels hold.
+    """
+    sides = stored.unflatten(1, (3, 2, color_width))
+    negative = (direction < 0)[:, :, None]
+    return torch.where(negative, sides[:, :, 1], sides[:, :, 0]).unbind(1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -20,7 +20,7 @@ class Levels:
 
     def __init__(self, args: TraceArguments, real: torch.dtype) -> None:
         counts = [float(args.branching**depth) for depth in range(args.max_depth + 1)]
-        self.branching = args.branching
+        self.branching, self.border = args.branching, args.border
         self.count_d = torch.tensor(counts, dtype=torch.float64, device=args.place_33.device)
         # (d,) nodes along a side of the root cube, and the side of a node in tree units
         self.size_d = 1 / self.count_d
@@ -38,32 +38,46 @@ class Levels:
         voxel_above = torch.where(depth > 0, self.voxel_d[(depth - 1).clamp(min=0)], INF)
         return self.voxel_d[depth], voxel_above
 
-    def cells(self, position_r3: Tensor, depth: Tensor) -> Tensor:
-        """Returns (r, 3) int64 x, y, z of the nodes at a depth (r,) around float64 positions."""
-        finest = torch.floor(position_r3 * self.count_d[-1]).to(torch.int64)
+    def finest_cells(self, position_r3: Tensor) -> Tensor:
+        """Returns (r, 3) int64 x, y, z of the nodes of the largest depth around float64 positions:
+        the argument `finest` of the methods below.
+        """
+        return torch.floor(position_r3 * self.count_d[-1]).to(torch.int64)
+
+    def cells(self, finest: Tensor, depth: Tensor) -> Tensor:
+        """Returns (r, 3) int64 x, y, z of the nodes at a depth (r,) that contain the finest."""
         cells_per_node = self.count_d[len(self.count_d) - 1 - depth].to(torch.int64)
         return finest // cells_per_node[:, None]
 
-    def corners(self, position_r3: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    def corners(self, finest: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r, 3) float64 low and high corners of the same nodes."""
-        cell, size = self.cells(position_r3, depth), self.size_d[depth, None]
+        cell, size = self.cells(finest, depth), self.size_d[depth, None]
         return cell * size, (cell + 1) * size
 
-    def holder(self, node: Tensor, brick: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
-        """Returns nodes (r,), with brick words, that were found at a depth around positions."""
-        corner, _ = self.corners(position_r3, depth)
-        return Holder(node, brick, depth, corner, self.scale_d[depth])
+    def holder(
+        self, node: Tensor, brick: Tensor, depth: Tensor, finest: Tensor, beam: Beam
+    ) -> Holder:
+        """Returns nodes (r,), with brick words, at a depth, and where the rays lie in them."""
+        corner, _ = self.corners(finest, depth)
+        scale = self.scale_d[depth]
+        start = (beam.exact_origin - corner).to(scale) * scale[:, None] + (self.border - 0.5)
+        return Holder(node, brick, depth, scale, start, beam.direction * scale[:, None])
 
 
 @dataclass
 class Holder(Rows):
-    """A node that holds data, and its brick."""
+    """A node that holds data, its brick, and where a ray lies in it."""
 
     node: Tensor  # (r,) int64; -1: none holds data
     brick: Tensor  # (r,) int64 slot, or the node's brick word below 0
     depth: Tensor  # (r,) int64
-    corner: Tensor  # (r, 3) float64, tree units
     scale: Tensor  # (r,) voxels a tree unit
+    start: Tensor  # (r, 3) x, y, z where the ray begins, in voxels from the brick's first centre
+    direction: Tensor  # (r, 3) voxels per world unit
+
+    def at(self, t: Tensor) -> Tensor:
+        """Returns (r, 3) x, y, z at distances t (r,), in voxels from the brick's first centre."""
+        return self.start + t[:, None] * self.direction
 
 
 @dataclass
@@ -97,7 +111,7 @@ class Tree:
         self.request_n, self.per_tile = args.request_tn.view(-1), args.child_tn.shape[1]
 
     def descend(
-        self, position_r3: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
+        self, finest: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
     ) -> Descent:
         """Descends from the root to the wanted depth, or as far as tiles exist and something is
         seen; stamps the tiles.
@@ -120,17 +134,17 @@ class Tree:
             active = active & (descent.depth < wanted_r) & (tile >= 0) & ~descent.hidden
             if not active.any():
                 return descent
-            x, y, z = (self.levels.cells(position_r3, descent.depth + active) % n).unbind(1)
+            x, y, z = (self.levels.cells(finest, descent.depth + active) % n).unbind(1)
             child = tile * self.per_tile + (z * n + y) * n + x
             descent.parent = torch.where(active, descent.node, descent.parent)
             descent.node = torch.where(active, child, descent.node)
             descent.depth = torch.where(active, descent.depth + 1, descent.depth)
             descent.hidden = torch.where(active, hides(descent.node), descent.hidden)
 
-    def holder(self, node: Tensor, depth: Tensor, position_r3: Tensor) -> Holder:
-        """Returns nodes (r,), or -1, that were found at a depth around positions."""
+    def holder(self, node: Tensor, depth: Tensor, finest: Tensor, beam: Beam) -> Holder:
+        """Returns nodes (r,), or -1, at a depth, and where the rays lie in them."""
         brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)].to(torch.int64), ABSENT)
-        return self.levels.holder(node, brick, depth, position_r3)
+        return self.levels.holder(node, brick, depth, finest, beam)
 
     def mark(
         self, descent: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, visible: Tensor
@@ -166,6 +180,8 @@ class Tree:
         """Joins requests into the request words: kinds by OR, priorities by maximum. A priority is
         the width of one voxel on the screen, in 1/16 pixel, up to 128 pixels.
         """
+        if not len(node):
+            return
         voxel = self.levels.voxel_d[depth]
         priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
         priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY)
@@ -179,7 +195,7 @@ class Tree:
 
 @dataclass
 class ChannelBricks:
-    """One component of one channel."""
+    """A channel, and which of a voxel's numbers is read: its component."""
 
     bricks_bzyxc: Tensor
     constant_nc: Tensor
@@ -192,14 +208,19 @@ class ChannelBricks:
         constant_nc, range_n2c = args.constant_tnc.flatten(0, 1), args.range_tn2c.flatten(0, 1)
         return cls(args.bricks_bzyxc, constant_nc, range_n2c, args.border, args.component)
 
-    def components(self, bricks: Tensor | None, constants: Tensor | None) -> tuple[Self, ...]:
-        """Returns every number of another channel of the same nodes; () where that is None."""
+    def other(self, bricks: Tensor | None, constants: Tensor | None, component: int) -> Self | None:
+        """Returns another channel of the same nodes; None where there is none."""
         if bricks is None:
-            return ()
+            return None
         if constants is None:  # a coarse channel, whose constants are never used
             constants = bricks.new_zeros((1, len(self.constant_nc), bricks.shape[4]))
-        other_bricks = replace(self, bricks_bzyxc=bricks, constant_nc=constants.flatten(0, 1))
-        return tuple(replace(other_bricks, component=c) for c in range(bricks.shape[4]))
+        constant_nc = constants.flatten(0, 1)
+        return replace(self, bricks_bzyxc=bricks, constant_nc=constant_nc, component=component)
+
+    @property
+    def width(self) -> int:
+        """How many numbers a voxel has."""
+        return self.bricks_bzyxc.shape[4]
 
     def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
@@ -211,37 +232,41 @@ class ChannelBricks:
         constant = self.constant_nc[:, self.component]
         return constant[a] == constant[b]
 
-    def constant(self, holder: Holder, real: torch.dtype) -> Tensor:
-        """Returns (r,) constants of nodes, 0 where there is no node."""
-        constant = self.constant_nc[holder.node.clamp(min=0), self.component].to(real)
-        return torch.where(holder.node >= 0, constant, 0.0)
+    def constants(self, holder: Holder, real: torch.dtype) -> Tensor:
+        """Returns (r, c) constants of nodes, 0 where there is no node."""
+        constant_rc = self.constant_nc[holder.node.clamp(min=0)].to(real)
+        return torch.where(holder.node[:, None] >= 0, constant_rc, 0.0)
 
-    def positions(self, holder: Holder, beam: Beam, t: Tensor) -> Tensor:
-        """Returns (r, 3) x, y, z in bricks at distances t (r,), in voxels from the first centre."""
-        scale = holder.scale[:, None]
-        offset = (beam.exact_origin - holder.corner).to(t.dtype) * scale + (self.border - 0.5)
-        return offset + t[:, None] * (beam.direction * scale)
+    @property
+    def single(self) -> ChannelBricks:
+        """The channel without the numbers that are not read."""
+        c = slice(self.component, self.component + 1)
+        return ChannelBricks(
+            self.bricks_bzyxc[..., c], self.constant_nc[:, c], self.range_n2c, self.border, 0
+        )
 
-    def sample(
-        self, holder: Holder, beam: Beam, t: Tensor, shift: Sequence[float] = (0, 0, 0)
-    ) -> Tensor:
-        """Returns (r,) trilinear values at distances t (r,), `shift` voxels off the ray; the node's
-        constant where it has no brick, 0 where there is no node.
+    def sample(self, holder: Holder, t: Tensor, shift: Tensor | float = 0.0) -> Tensor:
+        """Returns (r,) values of the component, or (..., r); see `samples`."""
+        return self.single.samples(holder, t, shift)[..., 0]
+
+    def samples(self, holder: Holder, t: Tensor, shift: Tensor | float = 0.0) -> Tensor:
+        """Returns (r, c) trilinear values at distances t (r,); the node's constants where it has no
+        brick, 0 where there is no node. `shift` (..., 1, 3) voxels, if given, is added to
+        positions; the result is then (..., r, c).
         """
         real, side = t.dtype, self.bricks_bzyxc.shape[1]
-        constant = self.constant(holder, real)
+        constant, position = self.constants(holder, real), holder.at(t) + shift
         if self.bricks_bzyxc.shape[0] == 0:
-            return constant
-        columns = zip(self.positions(holder, beam, t).unbind(1), shift, strict=True)
-        position = clamp(torch.stack([p + d if d else p for p, d in columns], 1), 0, side - 1)
+            return constant.expand(*position.shape[:-1], -1)
+        position = clamp(position, 0, side - 1)
         cell = smaller(torch.floor(position), torch.full_like(position, side - 2))
-        wx, wy, wz = (position - cell).unbind(1)
+        wx, wy, wz = (position - cell)[..., None].unbind(-2)
         pair = torch.arange(2, device=t.device)[:, None]
-        x, y, z = (cell.to(torch.int64)[:, None] + pair).unbind(2)
-        corners = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
+        x, y, z = (cell.to(torch.int64)[..., None, :] + pair).unbind(-1)
+        corners = (z[..., :, None, None], y[..., None, :, None], x[..., None, None, :])
         brick = holder.brick.clamp(min=0)[:, None, None, None]
-        value_rzyx = self.bricks_bzyxc[(brick, *corners, self.component)].to(real)  # (r, 2, 2, 2)
-        left, right = value_rzyx.unbind(3)
-        low, high = (left + wx[:, None, None] * (right - left)).unbind(2)
-        near, far = (low + wy[:, None] * (high - low)).unbind(1)
-        return torch.where(holder.brick >= 0, near + wz * (far - near), constant)
+        value_rzyxc = self.bricks_bzyxc[(brick, *corners)].to(real)
+        left, right = value_rzyxc.unbind(-2)
+        low, high = (left + wx[..., None, None] * (right - left)).unbind(-2)
+        near, far = (low + wy[..., None] * (high - low)).unbind(-2)
+        return torch.where(holder.brick[:, None] >= 0, near + wz * (far - near), constant)

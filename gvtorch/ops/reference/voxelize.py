@@ -118,13 +118,14 @@ def _nearest(
     height = _dot(normal, position_p3[:, None] - a)
     plane_gap2 = height * height / torch.where(length2 > 0, length2, 1)
     best = torch.where(inside, plane_gap2, best)
+    best = torch.where(best < torch.inf, best, torch.inf)  # NaN is nowhere
     gap2 = best.amin(1)
     rows = torch.arange(len(a), device=a.device)
     row = torch.where(best == gap2[:, None], rows, len(a)).amin(1)
     point_index = torch.arange(len(position_p3), device=a.device)
     use_normal = inside[point_index, row] | (gap2 < TOUCH)
     away = torch.where(use_normal[:, None], normal[row], toward[point_index, row])
-    in_reach = (gap2 <= reach * reach) & (reach >= 0)
+    in_reach = (gap2 <= reach * reach) & (reach >= 0) & (gap2 < torch.inf)
     return sqrt_exact(torch.where(in_reach, gap2, torch.inf)), torch.where(in_reach, row, -1), away
 
 
