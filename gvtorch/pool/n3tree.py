@@ -263,10 +263,11 @@ class N3Tree:
         build_device = choose_build_device(originals.values(), device)
         volumes = {name: volume.to(build_device) for name, volume in originals.items()}
         first = next(iter(volumes.values()))
-        check.integer("from_volume", "branching", branching, low=2, high=MAX_BRANCHING)
+        branching = check.integer("from_volume", "branching", branching, low=2, high=MAX_BRANCHING)
         threshold = checked_threshold("from_volume", threshold, volumes)
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
-        BrickPool(0, channels, brick_size=brick_size, border=border)  # its checks, before the work
+        checked = BrickPool(0, channels, brick_size=brick_size, border=border)  # before the work
+        brick_size, border = checked.brick_size, checked.border
         depth = tree_depth(first.extent, brick_size, branching)
         levels = levels_by_depth(volumes, depth, branching, brick_size, border, progress)
         plan = TreePlan(levels, branching, threshold)
