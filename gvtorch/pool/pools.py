@@ -8,6 +8,7 @@ import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import torch
@@ -126,7 +127,7 @@ class _Pool:
         """Number of slots."""
         return next(len(field) for field in vars(self).values() if isinstance(field, Tensor))
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Bytes of all fields."""
         return sum(field.nbytes for field in self.fields.values())
