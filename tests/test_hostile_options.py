@@ -202,6 +202,9 @@ def test_closing_twice_leaves_a_producer_to_its_next_engine(volume):
         assert producer.layout is not None
         assert second.render(VIEW, GRAY).stats.converged
     assert producer.layout is None
+    with pytest.raises(ValueError, match="serves another engine, or another tree of this one"):
+        gv.Engine({"a": producer, "b": producer}, **SIZE)
+    assert producer.layout is None
 
 
 def test_all_bricks_may_hold_coarse_channels(volume):

@@ -46,7 +46,8 @@ class EngineOptions:
         scout_rounds: Most passes of scouts, each at most a sixteenth of the rays, before a picture
             while something is missing.
         patience: Seconds until an answer that does not come is given up.
-        coarse_share: Share of the brick slots that also hold coarse channels, if there are any.
+        coarse_share: Share of the brick slots that also hold coarse channels, if there are any;
+            the finest level is left with the others.
         strict: Whether to raise when something can't be produced.
         monitor: Whether to time the stages and remember the last frames, for `report`.
     """
@@ -226,8 +227,8 @@ def make_tree(
     scene[name] = layout
     if producer.layout is not None:
         raise ValueError(
-            f"Engine: the producer of tree {name!r} serves another engine: "
-            "close that one, or make another producer"
+            f"Engine: the producer of tree {name!r} serves another engine, or another tree of this "
+            "one: close that engine, or make another producer"
         )
     producer.to(device)
     producer.prepare(layout)
