@@ -59,6 +59,7 @@ def test_three_planes_in_line(volume):
     [
         *[(0.0, 0), (0.5, 7), (1.0, 13), (5, 5), ("50%", 7), ("13", 13), ("-4mm", 0)],
         *[("-3.1mm", 0), ("-2.9 mm", 1), ("0.2cm", 3), ("-2000um", 1)],
+        *[("-2000 \u00b5m", 1), ("-2000\u03bcm", 1), (np.float32(0.5), 7), (np.int8(5), 5)],
     ],
 )
 def test_places(volume, position, index):
@@ -100,6 +101,10 @@ def test_colours_and_components():
         ({"position": 14}, "position along z must be an int >= 0 and <= 13"),
         ({"position": "here"}, "position must be a share such as 50%"),
         ({"position": "99mm"}, "99mm lies beyond the data, z is -5 to 23 millimeter"),
+        ({"position": "-1e400mm"}, "-1e400mm lies beyond the data"),
+        ({"colors": lambda v: v}, r"colors must return red, green, blue .*, got \(12, 10\) of"),
+        ({"colors": lambda v: None}, "colors must return red, green, blue"),
+        ({"colors": lambda v: np.zeros((*v.shape, 2))}, "colors must return red, green, blue"),
         ({"position": ("1", "2", "3")}, "position must be one for"),
         ({"axis": "all", "position": (0.5, 0.5)}, "position must be one or three, for x, y and z"),
         ({"up": "+z"}, r"up must be \+y, -y, \+x or -x across z"),

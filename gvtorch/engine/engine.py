@@ -292,8 +292,8 @@ class Engine(FrameSteps):
             )
         if view.options.layer is not None:
             view.options.layer.check_device(self.device)
-        check.integer("capture", "batch", batch, low=1, high=1 << 18)
-        check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
+        batch = check.integer("capture", "batch", batch, low=1, high=1 << 18)
+        look_ahead = check.number("capture", "look_ahead", look_ahead, low=0, high=1000)
         check.instance("capture", "fit", fit, bool)
         render_frame = partial(self.frame, shader=shader, **options)
         render_frame(camera)  # warm-up before recording
@@ -334,7 +334,7 @@ class Engine(FrameSteps):
         tiles, bricks = self.cache.nodes.parent_t, self.cache.bricks.owner_b
         slots = {"tiles": tiles, "bricks": bricks}
         occupancy = {name: float((owner >= 0).float().mean()) for name, owner in slots.items()}
-        return Report(self._recent_stats, occupancy, self.memory())
+        return Report(tuple(self._recent_stats), occupancy, self.memory())
 
     @_locked
     def validate(self) -> None:

@@ -46,7 +46,8 @@ class EngineOptions:
         scout_rounds: Most passes of scouts, each at most a sixteenth of the rays, before a picture
             while something is missing.
         patience: Seconds until an answer that does not come is given up.
-        coarse_share: Share of the brick slots that also hold coarse channels, if there are any.
+        coarse_share: Share of the brick slots that also hold coarse channels, if there are any;
+            the finest level is left with the others.
         strict: Whether to raise when something can't be produced.
         monitor: Whether to time the stages and remember the last frames, for `report`.
     """
@@ -70,14 +71,22 @@ class EngineOptions:
     __repr__ = check.summary
 
     def __post_init__(self) -> None:
-        check.one_of("Engine", "loading", self.loading, ("straight", "levels"))
-        check.one_of("Engine", "order", self.order, ("coarse", "fine"))
-        check.number("Engine", "patience", self.patience, low=0, open_low=True)
-        check.number("Engine", "coarse_share", self.coarse_share, low=0, high=1, open_low=True)
-        if self.time_budget is not None:
-            check.number("Engine", "time_budget", self.time_budget, low=0, open_low=True)
+        context, time_budget = "Engine", self.time_budget
+        check.one_of(context, "loading", self.loading, ("straight", "levels"))
+        check.one_of(context, "order", self.order, ("coarse", "fine"))
+        if time_budget is not None:
+            time_budget = check.number(context, "time_budget", time_budget, low=0, open_low=True)
+        vars(self).update(
+            brick_size=check.integer(context, "brick_size", self.brick_size, low=2, high=256),
+            border=check.integer(context, "border", self.border, low=0, high=16),
+            patience=check.number(context, "patience", self.patience, low=0, open_low=True),
+            coarse_share=check.number(
+                context, "coarse_share", self.coarse_share, low=0, high=1, open_low=True
+            ),
+            time_budget=time_budget,
+        )
         for name, low in (("load_budget", 1), ("subdivide_budget", 1), ("scout_rounds", 0)):
-            check.integer("Engine", name, getattr(self, name), low=low)
+            vars(self)[name] = check.integer(context, name, getattr(self, name), low=low)
         for name in ("strict", "monitor"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
@@ -120,7 +129,9 @@ def make_pools(
     if all_nbytes > fine_nbytes:
         pool_nbytes = check.nbytes("Engine", "brick_pool", options.brick_pool)
         mean_nbytes = fine_nbytes + options.coarse_share * (all_nbytes - fine_nbytes)
-        coarse = max(roots + 1, int(options.coarse_share * pool_nbytes / mean_nbytes))
+        coarse = int(options.coarse_share * pool_nbytes / mean_nbytes)
+        # At least one slot is left for bricks of the finest level.
+        coarse = max(roots + 1, min(coarse, (pool_nbytes - fine_nbytes) // all_nbytes))
     coarse_nbytes = coarse * (all_nbytes - fine_nbytes)
     tiles = _count_slots("node_pool", options.node_pool, tile_nbytes, roots + 1 + branching)
     bricks = _count_slots(
@@ -201,9 +212,8 @@ def _all_channels(producers: Mapping[str, Producer]) -> dict[str, Channel]:
 
 def brick_bytes(channels: Mapping[str, Channel], options: EngineOptions) -> int:
     """Returns the bytes of a brick's voxels, its border and all channels counted."""
-    size = check.integer("Engine", "brick_size", options.brick_size, low=2, high=256)
-    border = check.integer("Engine", "border", options.border, low=0, high=16)
-    return (size + 2 * border) ** 3 * sum(channel.nbytes for channel in channels.values())
+    side = options.brick_size + 2 * options.border
+    return side**3 * sum(channel.nbytes for channel in channels.values())
 
 
 def make_tree(
@@ -217,8 +227,8 @@ def make_tree(
     scene[name] = layout
     if producer.layout is not None:
         raise ValueError(
-            f"Engine: the producer of tree {name!r} serves another engine: "
-            "close that one, or make another producer"
+            f"Engine: the producer of tree {name!r} serves another engine, or another tree of this "
+            "one: close that engine, or make another producer"
         )
     producer.to(device)
     producer.prepare(layout)
@@ -242,20 +252,29 @@ def make_tree(
     source = ProducedTree(name, tree, producer, layout, options.patience)
     try:
         fill_root(cache, source)
-    except Exception as error:
+    except BaseException:  # Ctrl-C as well
         producer.close()
-        message = one_line(error)
-        if not isinstance(error, (ValueError, ProductionError)):
-            message = f"{type(error).__name__}: {message}"  # "division by zero" alone tells little
-        raise ProductionError(
-            f"Engine: the root of tree {name!r} can't be made: {message}"
-        ) from error
+        raise
     producer.layout = layout  # it serves this engine now
     return source
 
 
 def fill_root(cache: Cache, source: ProducedTree) -> None:
-    """Writes the root's content into its slots, which are reserved for it."""
+    """Writes the root's content into its slots, which are reserved for it. Raises `ProductionError`
+    if the producer fails.
+    """
+    try:
+        _fill_root(cache, source)
+    except Exception as error:
+        message = one_line(error)
+        if not isinstance(error, ValueError):
+            message = f"{type(error).__name__}: {message}"  # "division by zero" alone tells little
+        raise ProductionError(
+            f"Engine: the root of tree {source.name!r} can't be made: {message}"
+        ) from error
+
+
+def _fill_root(cache: Cache, source: ProducedTree) -> None:
     nodes, index, producer = cache.nodes, source.tree.root, source.producer
     tile = index // nodes.nodes_per_tile
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)

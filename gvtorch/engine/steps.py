@@ -239,5 +239,6 @@ class FrameSteps:
                 host_frame.close()
             self.production.close()
             for source in self.trees.values():
-                source.producer.close()
-                source.producer.layout = None
+                if source.producer.layout is source.layout:  # else another engine may use it now
+                    source.producer.close()
+                    source.producer.layout = None

@@ -263,10 +263,11 @@ class N3Tree:
         build_device = choose_build_device(originals.values(), device)
         volumes = {name: volume.to(build_device) for name, volume in originals.items()}
         first = next(iter(volumes.values()))
-        check.integer("from_volume", "branching", branching, low=2, high=MAX_BRANCHING)
+        branching = check.integer("from_volume", "branching", branching, low=2, high=MAX_BRANCHING)
         threshold = checked_threshold("from_volume", threshold, volumes)
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
-        BrickPool(0, channels, brick_size=brick_size, border=border)  # its checks, before the work
+        checked = BrickPool(0, channels, brick_size=brick_size, border=border)  # before the work
+        brick_size, border = checked.brick_size, checked.border
         depth = tree_depth(first.extent, brick_size, branching)
         levels = levels_by_depth(volumes, depth, branching, brick_size, border, progress)
         plan = TreePlan(levels, branching, threshold)
@@ -323,14 +324,15 @@ class N3Tree:
     @torch.no_grad()
     def refresh(self, box: Sequence[Sequence[float]] | Tensor | None = None) -> None:
         """Recomputes borders, coarse levels, regions and ranges after the finest bricks were edited
-        or trained. Then bricks, ranges and pictures equal, in every bit, those of a tree that
-        `from_volume` makes of `to_volume()`.
+        or trained. If every region had a brick when the tree was built, bricks, ranges and pictures
+        then equal, in every bit, those of a tree that `from_volume` makes of `to_volume()`.
 
         It reads the voxels of the finest bricks without their borders; all else is overwritten. A
         region without a brick, because it was CONSTANT or EMPTY when the tree was built, stays as
-        it is. One with a brick becomes CONSTANT or EMPTY where its voxels are, and uses its brick
-        again when they change; bricks that require gradients stay bricks. Coarse channels, such as
-        `Filtered` colours, are not updated and have to be made again. It runs on the host.
+        it is, up to its faces, whatever is edited beside it. One with a brick becomes CONSTANT or
+        EMPTY where its voxels are, and uses its brick again when they change; bricks that require
+        gradients stay bricks. Coarse channels, such as `Filtered` colours, are not updated and have
+        to be made again. It runs on the host.
 
         Args:
             box: (2, 3) world corners, low and high: only voxels that it touches were edited. None:

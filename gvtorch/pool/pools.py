@@ -8,6 +8,7 @@ import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import torch
@@ -32,11 +33,12 @@ class Channel:
     coarse: bool = False
 
     def __post_init__(self) -> None:
-        """Checks dtype and width."""
+        """Checks the fields."""
         if self.dtype not in CHANNEL_DTYPES:
             names = ", ".join(str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES)
             raise ValueError(f"Channel: dtype must be one of {names}, got {self.dtype}")
-        check.integer("Channel", "width", self.width, low=1)
+        vars(self)["width"] = check.integer("Channel", "width", self.width, low=1)
+        check.instance("Channel", "coarse", self.coarse, bool)
 
     @classmethod
     def of(cls, volume: Volume) -> Channel:
@@ -69,10 +71,12 @@ def volumes_by_channel(context: str, volume: Volume | Mapping[str, Volume]) -> d
 
     Arrays become volumes, see `as_volume`.
 
-    Raises ValueError if there is none, one is not a volume, or they differ in extent, spacing or
-    origin.
+    Raises ValueError if there is none, one is not a volume, a name is no str, or they differ in
+    extent, spacing or origin.
     """
     by_name = dict(volume) if isinstance(volume, Mapping) else {"value": volume}
+    for name in by_name:
+        check.instance(context, "name of a channel", name, str)
     volumes = {
         name: as_volume(array, context=f"{context}: channel {name!r}")
         for name, array in by_name.items()
@@ -123,7 +127,7 @@ class _Pool:
         """Number of slots."""
         return next(len(field) for field in vars(self).values() if isinstance(field, Tensor))
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Bytes of all fields."""
         return sum(field.nbytes for field in self.fields.values())
@@ -204,8 +208,8 @@ class NodePool(_Pool):
         Raises:
             ValueError: A number is out of its range, or node indices would not fit into int32.
         """
-        check.integer("NodePool", "capacity", capacity, low=1)
-        check.integer("NodePool", "branching", branching, low=2, high=MAX_BRANCHING)
+        capacity = check.integer("NodePool", "capacity", capacity, low=1)
+        branching = check.integer("NodePool", "branching", branching, low=2, high=MAX_BRANCHING)
         n = branching**3
         if capacity * n >= 2**31:
             raise ValueError(
@@ -278,9 +282,9 @@ class BrickPool(_Pool):
         Raises:
             ValueError: A number is out of its range, or there is no channel.
         """
-        check.integer("BrickPool", "capacity", capacity, low=0, high=2**31 - 1)
-        check.integer("BrickPool", "brick_size", brick_size, low=2, high=256)
-        check.integer("BrickPool", "border", border, low=0, high=16)
+        capacity = check.integer("BrickPool", "capacity", capacity, low=0, high=2**31 - 1)
+        brick_size = check.integer("BrickPool", "brick_size", brick_size, low=2, high=256)
+        border = check.integer("BrickPool", "border", border, low=0, high=16)
         if not channels:
             raise ValueError("BrickPool: channels must name at least one channel")
         self.brick_size, self.border = brick_size, border
@@ -320,11 +324,19 @@ class BrickPool(_Pool):
     def to(self, device: torch.device | str) -> Self:
         """Returns the pool on a device, with the same channels marked as edited."""
         other = super().to(device)
-        other._edited, other._reported = set(self.edited()), set(self._reported)
-        other._checked_states = {
-            name: _write_state(other.bricks[name]) for name in self._checked_states
-        }
+        other._note_states()
         return other
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Looks for edits first: the tensors of a copy have other addresses."""
+        self.edited()
+        return vars(self).copy()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restores a copied or pickled pool, with the same channels marked as edited."""
+        vars(self).update(state)
+        self._edited, self._reported = set(self._edited), set(self._reported)
+        self._note_states()
 
     def in_order(self) -> None:
         """Marks ranges, borders and coarse levels as up to date with the voxels."""
@@ -358,7 +370,13 @@ class BrickPool(_Pool):
     def writing(self) -> Iterator[None]:
         """Lets the block write voxels and their ranges: this does not count as an edit."""
         self.edited()
-        yield
+        try:
+            yield
+        finally:
+            self._note_states()
+
+    def _note_states(self) -> None:
+        """Takes note of the tensors as they are: from now on `edited` looks for later writes."""
         self._checked_states = {
             name: _write_state(self.bricks[name]) for name in self._checked_states
         }

@@ -45,7 +45,8 @@ class BrickTable:
         Raises:
             ValueError: They are not a contiguous tensor on the CPU, or hold NaN or infinite values.
         """
-        if bricks.dim() != 5 or bricks.device.type != "cpu" or not bricks.is_contiguous():
+        is_table = isinstance(bricks, Tensor) and bricks.dim() == 5
+        if not is_table or bricks.device.type != "cpu" or not bricks.is_contiguous():
             raise ValueError(
                 "BrickTable: bricks must be contiguous (n, z, y, x, c) on the CPU, "
                 f"got {check.describe(bricks)}"
@@ -58,7 +59,10 @@ class BrickTable:
         return len(self.bricks)
 
     def __getitem__(self, row: Tensor) -> TableRows:
-        """Selects bricks by their (k,) int64 rows; ValueError if one is outside the table."""
+        """Selects bricks by their (k,) rows, integers; ValueError if one is outside the table."""
+        is_list = isinstance(row, Tensor) and row.dim() == 1
+        if not is_list or row.is_floating_point() or row.dtype == torch.bool:
+            raise ValueError(f"BrickTable: rows must be (k,) integers, got {check.describe(row)}")
         row = row.to(device="cpu", dtype=torch.int64)
         if len(row) and (int(row.min()) < 0 or int(row.max()) >= len(self)):
             raise ValueError(f"BrickTable: rows must be 0 to {len(self) - 1}")

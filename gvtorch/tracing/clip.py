@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -41,9 +42,15 @@ class Clip:
     cap_light: float = 0.5  # share of caps' light that comes from the eye; without `Lighting` only
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frame", Coordinates.of("Clip", self.frame))
-        check.number("Clip", "cap_opacity", self.cap_opacity, low=0, high=1, open_low=True)
-        check.number("Clip", "cap_light", self.cap_light, low=0, high=1)
+        cap_opacity = check.number(
+            "Clip", "cap_opacity", self.cap_opacity, low=0, high=1, open_low=True
+        )
+        vars(self).update(
+            frame=Coordinates.of("Clip", self.frame),
+            caps=check.instance("Clip", "caps", self.caps, bool),
+            cap_opacity=cap_opacity,
+            cap_light=check.number("Clip", "cap_light", self.cap_light, low=0, high=1),
+        )
         _ = self._checked_faces
 
     def __repr__(self) -> str:
@@ -60,7 +67,7 @@ class Clip:
     def _checked_faces(self) -> Faces:
         """The clip's faces, checked and in the units of `frame`."""
         for name in Faces._fields:
-            if not isinstance(getattr(self, name), (Sequence, Tensor)):
+            if not _is_list(getattr(self, name)):
                 kind = type(getattr(self, name)).__name__
                 raise ValueError(f"Clip: {name} must be a list, got {kind}")
         planes = [_face(f"planes[{i}]", plane) for i, plane in enumerate(self.planes)]
@@ -256,6 +263,12 @@ class Clipped:
         )
 
 
+def _is_list(value: Any) -> bool:
+    """Returns whether a value is a list, or a tensor or array of at least one dimension."""
+    arrays = (Tensor, np.ndarray)
+    return isinstance(value, Sequence) or (isinstance(value, arrays) and value.ndim > 0)
+
+
 def _face(name: str, numbers: Any) -> Face:
     a, b, c, d = check.reals("Clip", name, numbers, (4,)).tolist()
     length = math.hypot(a, b, c)
@@ -266,7 +279,7 @@ def _face(name: str, numbers: Any) -> Face:
 
 def _box(name: str, numbers: Any) -> list[Face]:
     """Returns the six faces of a box."""
-    if not hasattr(numbers, "__len__"):
+    if not _is_list(numbers):
         raise ValueError(f"Clip: {name} must be two corners or a (4, 4) matrix, got {numbers!r}")
     if len(numbers) == 2:
         low, high = check.reals("Clip", name, numbers, (2, 3))

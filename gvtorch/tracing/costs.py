@@ -72,6 +72,7 @@ class Cost:
         from kornia.color import ColorMap, ColorMapType, rgb_to_linear_rgb
 
         check.one_of("Cost", "image", name, IMAGES)
+        low = check.number("Cost", "low", low)
         if colormap not in ColorMapType.__members__:
             names = ", ".join(sorted(ColorMapType.__members__))
             raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {names}")
@@ -79,6 +80,7 @@ class Cost:
         valid = ~image.isnan()
         if high is None:
             high = float(image[valid].max()) if valid.any() else 1.0
+        high = check.number("Cost", "high", high)
         position = ((image - low) / max(high - low, 1e-6)).clamp(0, 1)
         colors = rgb_to_linear_rgb(ColorMap(colormap, 256).colors[:, :, None])[:, :, 0].T
         color = colors[torch.where(valid, position * 255, 0).round().long()[..., 0]] * valid

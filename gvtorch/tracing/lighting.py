@@ -78,15 +78,21 @@ class Lighting:
             raise ValueError(f"{context}: lights must be a sequence of lights, got {kind}")
         for number, light in enumerate(self.lights or ()):
             check_light(f"{context}: lights[{number}]", light)
-        check.number(context, "shadows", self.shadows, low=0, high=1)
-        check.integer(context, "shadow_cones", self.shadow_cones, low=1, high=1024)
-        check.number(context, "occlusion", self.occlusion, low=0, high=1)
-        check.number(context, "indirect", self.indirect, low=0)
-        check.integer(context, "cones", self.cones, low=1, high=1024)
-        if self.reach is not None:
-            check.number(context, "reach", self.reach, low=0, open_low=True)
-        object.__setattr__(self, "frame", Coordinates.of(context, self.frame))
-        a_triple(low=0)(self, "ambient", self.ambient)
+        reach = self.reach
+        if reach is not None:
+            reach = check.number(context, "reach", reach, low=0, open_low=True)
+        vars(self).update(
+            shadows=check.number(context, "shadows", self.shadows, low=0, high=1),
+            shadow_cones=check.integer(
+                context, "shadow_cones", self.shadow_cones, low=1, high=1024
+            ),
+            occlusion=check.number(context, "occlusion", self.occlusion, low=0, high=1),
+            indirect=check.number(context, "indirect", self.indirect, low=0),
+            cones=check.integer(context, "cones", self.cones, low=1, high=1024),
+            reach=reach,
+            frame=Coordinates.of(context, self.frame),
+            ambient=a_triple(low=0)(self, "ambient", self.ambient),
+        )
 
     __repr__ = check.summary
 
@@ -264,8 +270,6 @@ class Lighted:
         if not (lighting.occlusion or lighting.indirect):
             return unblocked, bounced
         assert reach is not None
-        if rays.sample is None:
-            rays = replace(rays, sample=torch.arange(len(unblocked), device=unblocked.device))
         index = indices_if_few(points.is_hit)
         if index is not None:
             subset = points.select(index)

@@ -65,23 +65,27 @@ class RenderOptions:
 
     def __post_init__(self) -> None:
         context = "render"
-        check.number(context, "step", self.step, low=0, open_low=True)
+        vars(self).update(
+            step=check.number(context, "step", self.step, low=0, open_low=True),
+            background=checked_background(context, self.background),
+            stop_alpha=check.number(
+                context, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True
+            ),
+            depth_alpha=check.number(context, "depth_alpha", self.depth_alpha, low=0, high=1),
+            cone_scale=check.number(context, "cone_scale", self.cone_scale, low=0, open_low=True),
+            component=check.integer(context, "component", self.component, low=0),
+            pose=checked_poses(context, self.pose),
+        )
         check.one_of(context, "lod", self.lod, ("auto", "finest"))
-        object.__setattr__(self, "background", checked_background(context, self.background))
-        check.number(context, "stop_alpha", self.stop_alpha, low=0, high=1, open_low=True)
-        check.number(context, "depth_alpha", self.depth_alpha, low=0, high=1)
         if self.depth_alpha >= self.stop_alpha:
             raise ValueError(
                 f"{context}: depth_alpha must be below stop_alpha, "
                 f"got {self.depth_alpha} and {self.stop_alpha}"
             )
-        check.number(context, "cone_scale", self.cone_scale, low=0, open_low=True)
-        check.integer(context, "component", self.component, low=0)
-        kinds = dict(channel=str, clip=Clip, layer=Layer, lens=ThinLens, lighting=Lighting)
-        for name, kind in kinds.items():
+        kinds = dict(backend=str, channel=str, clip=Clip, layer=Layer, lens=ThinLens)
+        for name, kind in {**kinds, "lighting": Lighting}.items():
             if getattr(self, name) is not None:
                 check.instance(context, name, getattr(self, name), kind)
-        object.__setattr__(self, "pose", checked_poses(context, self.pose))
         if self.lens is not None and self.lod == "finest":
             raise ValueError(f"{context}: a lens blurs by level of detail: lod must be 'auto'")
         if self.dtype not in (torch.float32, torch.float64):

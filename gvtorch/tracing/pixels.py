@@ -110,13 +110,29 @@ def trace(tree: Scene, rays: Rays, shader: Shaders, **options: Unpack[RenderSett
         Colour, alpha, depth and samples of each ray, in the options' dtype.
 
     Raises:
-        ValueError: An option is unknown or out of its range, the channel is unknown, or the backend
-            can't be used.
+        ValueError: An option is unknown or out of its range, a column of the rays has another
+            shape, the channel is unknown, or the backend can't be used.
     """
     chosen = render_options("trace", options)
-    check.instance("trace", "rays", rays, Rays)
+    rays = _numbered(rays, chosen)
     with using("trace", _trees("trace", tree)):
         return trace_trees(_begin_frame("trace", tree, shader, chosen), rays)
+
+
+def _numbered(rays: Rays, options: RenderOptions) -> Rays:
+    """Returns rays with numbers (`Rays.sample`) if there is lighting, which may trace some of them
+    separately. Raises ValueError if their optional columns have another shape.
+    """
+    check.instance("trace", "rays", rays, Rays)
+    count, device = len(rays.origin), rays.origin.device
+    sample, light = rays.sample, rays.transmittance
+    if light is not None:
+        check.tensor("trace", "rays.transmittance", light, (count,), light.dtype, device)
+    if sample is not None:
+        check.tensor("trace", "rays.sample", sample, (count,), torch.int64, device)
+    elif options.lighting is not None:
+        return replace(rays, sample=torch.arange(count, device=device))
+    return rays
 
 
 def _resident(context: str, scene: Any) -> Scene:

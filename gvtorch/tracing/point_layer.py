@@ -52,6 +52,7 @@ def point_layer(
         raise ValueError(
             f"{context}: needs PointProducer(drawn=True) of 4 values, as of Points.lit"
         )
+    check.instance(context, "camera", camera, Camera)
     if camera.model != "pinhole" or camera.batched:
         raise ValueError(f"{context}: the camera must be one pinhole camera, got {camera!r}")
     check.number(context, "size", size, low=0.5, high=64)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -45,16 +46,19 @@ class Pose:
         left, _, right = torch.linalg.svd(turn)  # their product: the nearest orthogonal matrix
         return cls(tuple(map(tuple, (left @ right).tolist())), tuple(numbers[:3, 3].tolist()))
 
+    @cached_property
+    def _inverse(self) -> tuple[tuple[float, ...], ...]:
+        """(3, 3), from the world's axes to the tree's."""
+        return tuple(zip(*self.turn, strict=True))
+
     def to_tree(self, rays: Rays) -> Rays:
         """Returns world rays in the tree's axes, in float64."""
-        origin, direction = rays.origin.double(), rays.direction.double()
-        columns = [o - s for o, s in zip(origin.unbind(1), self.shift, strict=True)]
-        inverse = tuple(zip(*self.turn, strict=True))
-        float_rays = rays.to(dtype=torch.float64)
+        rays = rays.to(dtype=torch.float64)
+        columns = [o - s for o, s in zip(rays.origin.unbind(1), self.shift, strict=True)]
         return replace(
-            float_rays,
-            origin=_rotate(inverse, columns),
-            direction=_rotate(inverse, direction.unbind(1)),
+            rays,
+            origin=_rotate(self._inverse, columns),
+            direction=_rotate(self._inverse, rays.direction.unbind(1)),
         )
 
     def to_world(self, hits: Hits) -> Hits:
@@ -81,8 +85,7 @@ class Pose:
             torch.where(is_point, a - s, a)
             for a, s in zip(light.unbind(0), self.shift, strict=True)
         ]
-        inverse = tuple(zip(*self.turn, strict=True))
-        light_3 = _rotate(inverse, [column[None] for column in columns])[0].to(parameter_54)
+        light_3 = _rotate(self._inverse, [column[None] for column in columns])[0].to(parameter_54)
         return torch.cat((light_3, parameter_54.reshape(-1)[3:])).view_as(parameter_54)
 
     def box(self, tree_box: Tensor) -> Tensor:

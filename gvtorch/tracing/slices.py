@@ -225,14 +225,16 @@ class _PlaneReader:
                 position = int(text)
             else:
                 return self._index_in_world(axis, text)
-        if isinstance(position, float):
+        if isinstance(position, (float, np.floating)):
             fraction = check.number(context, "position", position, low=0, high=1)
             return min(int(fraction * count), count - 1)
         return check.integer(context, f"position along {axis}", position, low=0, high=count - 1)
 
     def _index_in_world(self, axis: str, text: str) -> int:
         """Returns the index of the voxel at a world position, as in "12.5mm"."""
-        match = re.fullmatch(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-zµ]+)", text)
+        match = re.fullmatch(
+            r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([a-z\u00b5\u03bc]+)", text
+        )
         unit = None if match is None else length_unit(match[2])
         if match is None or unit is None:
             raise ValueError(
@@ -245,14 +247,14 @@ class _PlaneReader:
             if text_metres is None or data_metres is None:
                 raise ValueError(f"slice_picture: the unit of the data is {self.unit}, got {text}")
             position *= text_metres / data_metres
-        index = int(np.floor((position - self.origin[axis]) / self.step[axis] + 0.5))
+        index = np.floor((position - self.origin[axis]) / self.step[axis] + 0.5)
         low, high = (
             self.origin[axis] + (n - 0.5) * self.step[axis] for n in (0, self.finest[axis])
         )
         if not 0 <= index < self.finest[axis]:
             ends = f"{low:g} to {high:g} {self.unit or ''}".rstrip()
             raise ValueError(f"slice_picture: {text} lies beyond the data, {axis} is {ends}")
-        return index
+        return int(index)
 
     def values(self, axis: str, position: Position) -> np.ndarray:
         """Returns the plane across an axis, with the other two in the order z, y, x."""
@@ -284,7 +286,13 @@ class _PlaneReader:
         rows, columns = (_voxel_of_pixels(self.extent[n], self.spacing[n] / pixel) for n in others)
         rows = rows[::-1] if up[0] == "+" else rows
         columns = columns[::-1] if view.mirrored else columns
-        image = colors(values)[..., :3].astype(np.float32)[np.ix_(rows, columns)]
+        colored = np.asarray(colors(values), np.float32)
+        if colored.ndim != 3 or colored.shape[:2] != values.shape or colored.shape[2] < 3:
+            raise ValueError(
+                "slice_picture: colors must return red, green, blue (..., 3) of values (...), "
+                f"got {colored.shape} of {values.shape}"
+            )
+        image = colored[np.ix_(rows, columns)][..., :3]
         if view.letters:
             draw_letters(image, view.letters)
         return image

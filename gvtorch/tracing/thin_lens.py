@@ -41,9 +41,11 @@ class ThinLens:
     frame: Coordinates | str = Coordinates.WORLD  # or largest sides of the scene's box
 
     def __post_init__(self) -> None:
-        check.number("ThinLens", "aperture", self.aperture, low=0)
-        check.number("ThinLens", "focus", self.focus, low=0, open_low=True)
-        object.__setattr__(self, "frame", Coordinates.of("ThinLens", self.frame))
+        vars(self).update(
+            aperture=check.number("ThinLens", "aperture", self.aperture, low=0),
+            focus=check.number("ThinLens", "focus", self.focus, low=0, open_low=True),
+            frame=Coordinates.of("ThinLens", self.frame),
+        )
 
     __repr__ = check.summary
 

@@ -61,6 +61,7 @@ class TreeTracer(torch.nn.Module):
         super().__init__()
         if unavailable()["cpp"]:
             raise RuntimeError(f"TreeTracer needs the compiled op: {unavailable()['cpp']}")
+        check.instance("TreeTracer", "tree", tree, N3Tree)
         check_shader("TreeTracer", "shader", shader)
         if shader.uses_torch:
             kind = type(shader).__name__
