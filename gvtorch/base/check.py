@@ -290,11 +290,11 @@ def number(
     open_low: bool = False,
 ) -> float:
     """Returns `value` as a float; ValueError unless finite and in [low, high] (or (low, high]).
-    Texts, bools and complex numbers are none, though `float` takes some of them.
+    Text and complex numbers are none, though `float` takes some of them.
     """
     no_gradient(context, name, value)
     try:
-        if isinstance(value, (str, bytes, bool)) or _is_complex(value):
+        if isinstance(value, (str, bytes)) or _is_complex(value):
             raise TypeError
         result = float(value)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # the last from tensors

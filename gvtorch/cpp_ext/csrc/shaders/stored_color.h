@@ -64,9 +64,9 @@ struct StoredColor : ShaderFacts {
   template <class V, class AnyProbe>
   GV_HD V opacity_of(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
     const auto& channel = probe.channels.value;
-    if (channel.width == 4) return saturate(piece.value * numbers().scale);
     const auto read = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
-    return saturate(of_sides(mask, probe, read) * numbers().scale);
+    const V value = channel.width == 4 ? piece.value : of_sides(mask, probe, read);
+    return saturate(value * numbers().scale);
   }
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
     return stretch(opacity_of(true, piece, probe), piece.length / numbers().reference_length);
@@ -97,11 +97,11 @@ struct StoredColor : ShaderFacts {
   GV_HD static Row<V> four_seen(MaskOf<V> mask, const AnyProbe& probe, V t) {
     const auto& channel = probe.channels.value;
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_at(lanes, channel, first, t); };
-    if (channel.width > 4) return of_sides(mask, probe, read);
     if constexpr (kPacket<V>) {
+      if (channel.width > 4) return of_sides(mask, probe, read);
       return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
-    } else {
-      return read(true, 0);
+    } else {  // `mask` is true, which the compiler may not know
+      return channel.width == 4 ? read(true, 0) : of_sides(true, probe, read);
     }
   }
   template <class Mask, class AnyProbe, class Read>
