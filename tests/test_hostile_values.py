@@ -40,13 +40,17 @@ KINDS = ("png", "exr", "npz", "npy", "tif")
 
 @contextmanager
 def full_disk(size: int) -> Iterator[None]:
-    """Limits the size of files: writing beyond it fails as on a full disk, in any library."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    """Limits the size of files: writing beyond it fails as on a full disk, in any library. Modules
+    imported meanwhile are not kept as bytecode: Python 3.11 would keep the part that it can write.
+    """
+    before, kept = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    sys.dont_write_bytecode = True
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = kept
 
 
 @pytest.fixture(scope="module")

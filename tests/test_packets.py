@@ -107,19 +107,21 @@ def check_bits(tree: gv.N3Tree, size: int, shader: gv.Shader, **options) -> None
     "name",
     ["plain", "lit", "lit by stored normals", "stored colour", "isosurface", "features"],
 )
-def test_a_pool_of_one_brick_is_read_in_packets(name, dtype):
+@pytest.mark.parametrize("brick", [8, 32], ids=["copied", "not copied"])
+def test_a_pool_of_one_brick_is_read(name, dtype, brick):
+    """It is copied, with room for loads beyond a voxel, if that is little beside the rays."""
     numbers = torch.rand((4, 6, 7, 5), generator=torch.Generator().manual_seed(3))
     factor = 1 if dtype.is_floating_point else 1.9
     channels = {"value": numbers[0], "rgba": numbers.movedim(0, -1), "normal": numbers[:3]}
     channels["normal"] = channels["normal"].movedim(0, -1)
     volumes = {key: gv.Volume((some * factor).to(dtype)) for key, some in channels.items()}
-    tree = gv.N3Tree.from_volume(volumes, 8)
+    tree = gv.N3Tree.from_volume(volumes, brick)
     assert tree.bricks.capacity == 1
     check_bits(tree, 9, SHADERS[name])
 
 
 @pytest.mark.backend("cpp")
-def test_a_pool_without_bricks_is_read_in_packets():
+def test_a_pool_without_bricks_is_none_to_read():
     """All nodes are constant."""
     volumes = {
         "value": gv.Volume(torch.full((9, 9, 9), 0.6)),

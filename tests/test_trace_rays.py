@@ -184,6 +184,7 @@ def test_strange_rays_end(blobs, backend):
     tree = gv.N3Tree.from_volume(blobs, 4)
     centre = tree.box.mean(0).tolist()
     zero, inf, nan = 0.0, math.inf, math.nan
+    strange = ((zero, zero, zero), (nan, 1, 0), (0, nan, 1), (1, 0, inf), (-inf, 1, 0))
     cases = [
         (centre, (zero, zero, zero), (0, 0), (0, inf)),
         (centre, (nan, nan, nan), (0, 0), (0, inf)),
@@ -193,6 +194,11 @@ def test_strange_rays_end(blobs, backend):
         (centre, (1, 0, 0), (nan, nan), (0, inf)),
         (centre, (1, 0, 0), (inf, inf), (0, inf)),
         (centre, (1, 0, 0), (0, 0), (5, 1)),
+        *((centre, direction, (0, 0), (0, 5)) for direction in strange),
+        *(
+            (origin, (1, 0, 0), (0, 0), (0, 5))
+            for origin in ((nan, *centre[1:]), (*centre[:2], -inf))
+        ),
         (centre, (1, 0, 0), (0, 0), (nan, nan)),
         (centre, (1e-30, 1e-30, 1), (0, -1), (0, inf)),
         (centre, (1, 0, 0), (0, 0), (0, inf)),
@@ -201,7 +207,10 @@ def test_strange_rays_end(blobs, backend):
     rays = gv.Rays(**dict(zip(("origin", "direction", "cone", "range"), columns, strict=True)))
     result, _ = trace(tree, backend, rays)
     assert torch.isfinite(result["color"]).all() and torch.isfinite(result["alpha"]).all()
-    assert result["alpha"][0] == 0 and result["alpha"][-1] > 0
+    finite = torch.isfinite(rays.origin + rays.direction).all(1)
+    empty = ~finite | (rays.direction == 0).all(1)
+    assert empty.sum() == 11 and result["alpha"][-1] > 0
+    assert not result["alpha"][empty].any() and not result["samples"][empty].any()
 
 
 def test_no_rays(blobs, backend):

@@ -81,7 +81,9 @@ class Beam(Rows):
         )
         real_direction, *numbers = (column.to(real) for column in columns)
         start = rounded(origin + moved[:, None] * direction, deep, real)
-        return cls(scene, *start, real_direction, *numbers).clipped()
+        beam = cls(scene, *start, real_direction, *numbers).clipped()
+        seen = torch.isfinite(origin + direction).all(1) & (direction != 0).any(1)
+        return replace(beam, last=torch.where(seen, beam.last, beam.first))
 
     def clipped(self) -> Beam:
         """Returns the rays with distances clipped to the scene (slab test, Kay and Kajiya, 1986). A

@@ -61,29 +61,47 @@ struct StoredColor : ShaderFacts {
     T premultiplied, lit;  // 1 or 0
   };
   GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
-  template <class V, class AnyProbe>
-  GV_HD V opacity_of(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
+  template <class AnyProbe>
+  GV_HD T opacity_of(const Piece<T>& piece, const AnyProbe& probe) const {
     const auto& channel = probe.channels.value;
-    const auto read = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
-    const V value = channel.width == 4 ? piece.value : of_sides(mask, probe, read);
+    const auto read = [&](bool, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
+    const T value = channel.width == 4 ? piece.value : of_sides(probe, read);
     return saturate(value * numbers().scale);
   }
   GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
-    return stretch(opacity_of(true, piece, probe), piece.length / numbers().reference_length);
+    return stretch(opacity_of(piece, probe), piece.length / numbers().reference_length);
   }
   template <class V, class AnyProbe, class... Shadow>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
-    const V opacity = opacity_of(mask, piece, probe);
+    const auto& channel = probe.channels.value;
+    const V t = piece.middle;
+    if constexpr (kPacket<V>) {
+      if (channel.width > 4) return add_by_direction(mask, piece, probe, sum);
+      const auto read = [&](int32_t number) { return probe.number_at(channel, number, t); };
+      const auto stored = [&](MaskOf<V>) { return Row<V>{read(0), read(1), read(2), V{}}; };
+      add_stored(mask, saturate(piece.value * numbers().scale), stored, piece, probe, sum);
+    } else {
+      const auto read = [&](bool, int32_t first) { return probe.four_at(true, channel, first, t); };
+      const auto stored = [&](bool) { return channel.width == 4 ? read(true, 0) : of_sides(probe, read); };
+      add_stored(mask, opacity_of(piece, probe), stored, piece, probe, sum, shadow...);
+    }
+  }
+
+ private:
+  // Adds an interval; stored(mask) returns the numbers as seen along the ray, of which the fourth is not read.
+  template <class V, class Stored, class AnyProbe, class... Shadow>
+  GV_HD void add_stored(MaskOf<V> mask, V opacity, const Stored& stored, const Piece<V>& piece, AnyProbe& probe,
+                        ShadeSum<V>& sum, const Shadow&... shadow) const {
     const MaskOf<V> shown = mask && opacity > 0;
     if (!any(shown)) return;
     probe.select_lanes(shown);
-    const Row<V> stored = four_seen(shown, probe, piece.middle);
+    const Row<V> seen = stored(shown);
     const auto color = [&](V number) {
       const V scaled = number * numbers().scale;
       return numbers().premultiplied > 0 ? scaled / opacity : scaled;
     };
-    Row<V> row{color(stored.red), color(stored.green), color(stored.blue),
+    Row<V> row{color(seen.red), color(seen.green), color(seen.blue),
                stretch(opacity, piece.length / numbers().reference_length)};
     if (numbers().lit > 0) {
       const Vec3<V> n = light.normal(probe, piece.middle);
@@ -92,21 +110,21 @@ struct StoredColor : ShaderFacts {
     }
     sum.add(row, piece, shown);
   }
-  // All four numbers as seen along the ray; of four in all, a packet does not read the opacity, which it already has.
+  // A packet's colours by direction: a call, which keeps the loop of other colours as fast as without these.
   template <class V, class AnyProbe>
-  GV_HD static Row<V> four_seen(MaskOf<V> mask, const AnyProbe& probe, V t) {
+  GV_RARE void add_by_direction(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
     const auto& channel = probe.channels.value;
-    const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_at(lanes, channel, first, t); };
-    if constexpr (kPacket<V>) {
-      if (channel.width > 4) return of_sides(mask, probe, read);
-      return {probe.number_at(channel, 0, t), probe.number_at(channel, 1, t), probe.number_at(channel, 2, t), V{}};
-    } else {  // `mask` is true, which the compiler may not know
-      return channel.width == 4 ? read(true, 0) : of_sides(true, probe, read);
-    }
+    const Vec3<V> d = probe.sight.direction;
+    const V t = piece.middle;
+    const auto number = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, t); };
+    const auto four = [&](MaskOf<V> lanes, int32_t first) { return probe.four_at(lanes, channel, first, t); };
+    const auto stored = [&](MaskOf<V> shown) { return by_direction(shown, d, channel.width, four); };
+    add_stored(mask, saturate(by_direction(mask, d, channel.width, number) * numbers().scale), stored, piece, probe,
+               sum);
   }
-  template <class Mask, class AnyProbe, class Read>
-  GV_RARE static auto of_sides(Mask mask, const AnyProbe& probe, const Read& read) {
-    return by_direction(mask, probe.sight.direction, probe.channels.value.width, read);
+  template <class AnyProbe, class Read>
+  GV_RARE static auto of_sides(const AnyProbe& probe, const Read& read) {
+    return by_direction(true, probe.sight.direction, probe.channels.value.width, read);
   }
 };
 

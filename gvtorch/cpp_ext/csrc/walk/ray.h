@@ -45,11 +45,14 @@ struct Ray {
   Ray() = default;
   GV_HD Ray(const RayView& rays, int64_t index) {
     Vec3<double> from, along, start;
-    double entry = -INFINITY;
+    double entry = -INFINITY, zero = 0;
+    bool moves = false;
     for (int axis = 0; axis < 3; ++axis) {
       const double size = rays.place_33[3 + axis];
       from[axis] = (rays.origin_r3[3 * index + axis] - rays.place_33[axis]) / size;
       along[axis] = rays.direction_r3[3 * index + axis] / size;
+      zero += 0 * (from[axis] + along[axis]);
+      moves = moves || along[axis] != 0;
       const double face = along[axis] > 0 ? -from[axis] : rays.high(axis) - from[axis];  // the nearer one
       if (along[axis] != 0) entry = larger(entry, face / along[axis]);
     }
@@ -65,6 +68,7 @@ struct Ray {
       direction[axis] = static_cast<T>(along[axis]);
     }
     begin(rays, start);
+    if (!moves || !(zero == 0)) last = first;  // without a direction, or with NaN or infinity
   }
 
   // A secondary cone from a position inside the scene (tree units), along a direction in the world.
