@@ -44,9 +44,10 @@ def test_an_include_that_is_no_file_is_left_to_the_compiler(tmp_path, included):
     "entries", [[1], [None], [[]], [True], ["x" * 5000], ["a\0b"], {"a": 1}, 7], ids=repr
 )
 def test_a_damaged_list_of_files_is_no_error(entries):
-    list_path = user.ShaderSource.read(HEADER, "mine::Plain").list_path
-    list_path.write_text(json.dumps(entries))
-    user.ShaderSource.read(HEADER, "mine::Plain")
+    source = user.ShaderSource.read(HEADER, "mine::Plain")
+    source.list_path.write_text(json.dumps(entries))
+    again = user.ShaderSource.read(HEADER, "mine::Plain")
+    assert again.header_files == source.header_files and again.list_path == source.list_path
 
 
 def test_a_compiler_s_name_may_be_blank_and_must_end_its_quotes(monkeypatch):

@@ -77,6 +77,11 @@ class EngineOptions:
         if time_budget is not None:
             time_budget = check.number(context, "time_budget", time_budget, low=0, open_low=True)
         vars(self).update(
+            load_budget=check.integer(context, "load_budget", self.load_budget, low=1),
+            subdivide_budget=check.integer(
+                context, "subdivide_budget", self.subdivide_budget, low=1
+            ),
+            scout_rounds=check.integer(context, "scout_rounds", self.scout_rounds, low=0),
             brick_size=check.integer(context, "brick_size", self.brick_size, low=2, high=256),
             border=check.integer(context, "border", self.border, low=0, high=16),
             patience=check.number(context, "patience", self.patience, low=0, open_low=True),
@@ -85,8 +90,6 @@ class EngineOptions:
             ),
             time_budget=time_budget,
         )
-        for name, low in (("load_budget", 1), ("subdivide_budget", 1), ("scout_rounds", 0)):
-            vars(self)[name] = check.integer(context, name, getattr(self, name), low=low)
         for name in ("strict", "monitor"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")

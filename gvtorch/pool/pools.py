@@ -8,7 +8,6 @@ import copy
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Self
 
 import torch
@@ -127,7 +126,7 @@ class _Pool:
         """Number of slots."""
         return next(len(field) for field in vars(self).values() if isinstance(field, Tensor))
 
-    @cached_property
+    @property
     def nbytes(self) -> int:
         """Bytes of all fields."""
         return sum(field.nbytes for field in self.fields.values())

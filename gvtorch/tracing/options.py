@@ -82,8 +82,9 @@ class RenderOptions:
                 f"{context}: depth_alpha must be below stop_alpha, "
                 f"got {self.depth_alpha} and {self.stop_alpha}"
             )
-        kinds = dict(backend=str, channel=str, clip=Clip, layer=Layer, lens=ThinLens)
-        for name, kind in {**kinds, "lighting": Lighting}.items():
+        check.instance(context, "backend", self.backend, str)
+        kinds = dict(channel=str, clip=Clip, layer=Layer, lens=ThinLens, lighting=Lighting)
+        for name, kind in kinds.items():
             if getattr(self, name) is not None:
                 check.instance(context, name, getattr(self, name), kind)
         if self.lens is not None and self.lod == "finest":

@@ -217,11 +217,6 @@ class ChannelBricks:
         constant_nc = constants.flatten(0, 1)
         return replace(self, bricks_bzyxc=bricks, constant_nc=constant_nc, component=component)
 
-    @property
-    def width(self) -> int:
-        """How many numbers a voxel has."""
-        return self.bricks_bzyxc.shape[4]
-
     def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
         low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)

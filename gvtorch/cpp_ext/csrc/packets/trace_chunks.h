@@ -18,7 +18,7 @@ namespace gvtorch {
 // Sets args.packet_bricks, and pointers to the copies, which `copies` owns.
 inline void prepare_pools(const torch::stable::Tensor& like, ShadeArgs& args, torch::stable::Tensor (&copies)[3]) {
   constexpr int64_t kMaxNumbers = 1 << 24, kBytesPerRay = 256;
-  constexpr int32_t kSmallSide = 8;
+  constexpr int32_t kSmallSide = 8;  // always copied: idle lanes load at the first eight voxels, and it may end there
   struct Channel {
     const void*& bricks;
     VoxelType type;
