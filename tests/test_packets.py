@@ -22,6 +22,7 @@ def looks(*components: int) -> list[gv.ChannelLook]:
 
 
 SUN = gv.DirectionalLight((1.0, -1.0, 0.0), (1.0, 0.9, 0.8))
+WIDE_SUN = gv.DirectionalLight((0.3, -1.0, 0.6), angle=20.0)
 SHADERS = {
     "plain": TRANSFER,
     "lit": gv.Lit(TRANSFER),
@@ -29,12 +30,18 @@ SHADERS = {
     "lit by a lamp": gv.Lit(TRANSFER, light=LAMP),
     "lit by stored normals": gv.Lit(TRANSFER, normals="normal", light=SUN),
     "lit by stored normals and a lamp": gv.Lit(TRANSFER, normals="normal", light=LAMP),
+    "in the sun's shadows": gv.Lit(TRANSFER, light=SUN, shadows=True),
+    "in a lamp's shadows": gv.Lit(TRANSFER, normals="normal", light=LAMP, shadows=True),
+    "in a wide sun's shadows": gv.Lit(TRANSFER, light=WIDE_SUN, shadows=True),
+    "scattering": gv.Lit(TRANSFER, light=SUN, shadows=True, octaves=3, anisotropy=0.4),
     "pre-integrated": gv.PreIntegrated(TRANSFER),
     "stored colour": gv.StoredColor("rgba"),
     "stored colour, lit": gv.StoredColor("rgba", premultiplied=True, lit=True, light=LAMP),
     "stored colour, stored normals": gv.StoredColor("rgba", lit=True, normals="normal"),
     "colour by direction": gv.StoredColor("six"),
     "colour by direction, lit": gv.StoredColor("six", lit=True, normals="normal", light=LAMP),
+    "stored colour, shadows": gv.StoredColor("rgba", normals="normal", light=SUN, shadows=True),
+    "colour by direction, shadows": gv.StoredColor("six", light=LAMP, shadows=True),
     "isosurface": gv.Isosurface(0.45, light=LAMP),
     "distance field": gv.DistanceField(offset=0.4),
     "maximum": gv.Projection("maximum", TRANSFER),
@@ -54,6 +61,7 @@ CASES += [
     for name in (
         "plain",
         "lit by a lamp",
+        "in a lamp's shadows",
         "stored colour",
         "colour by direction",
         "isosurface",

@@ -1,4 +1,4 @@
-// The ops of rays on the CPU: in packets; one by one in float64, and where each sample traces a cone to the light.
+// The ops of rays on the CPU: in packets, or one by one in float64.
 
 #include "entry/entry.h"
 #include "packets/processor.h"
@@ -9,11 +9,7 @@ namespace gvtorch {
 
 void FusedShaders::run(const Tensor& like, ShadeArgs args, bool in_float64) {
   if (in_float64) return shade_fused<double>(like, args);
-  with_shader<float>(args.shader, [&](auto type) {
-    using Type = decltype(type);
-    if constexpr (Type::kShadows) return shade_as<float>(like, args, type);
-    trace_chunks(like, args, processor().chunks.shade);
-  });
+  trace_chunks(like, args, processor().chunks.shade);
 }
 
 }  // namespace gvtorch

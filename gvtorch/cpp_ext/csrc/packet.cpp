@@ -4,7 +4,7 @@
 #include "mesh/voxelize.h"
 #include "noise/noise.h"
 #include "packets/chunks.h"
-#include "packets/packet_walk.h"
+#include "packets/packet_shadows.h"
 #include "points/splat.h"
 
 namespace gvtorch::GV_NAMESPACE {
@@ -13,7 +13,7 @@ void shade_chunk(const ShadeArgs& args, int64_t begin, int64_t end) {
   if (args.shader != kPlainShader) {
     return with_shader<float>(args.shader, [&](auto type) {
       using Type = decltype(type);
-      if constexpr (!Type::kShadows) trace_packets<typename Type::Shader, AnyValues>(args, begin, end);
+      trace_packets<typename Type::Shader, AnyValues, Type::kShadows>(args, begin, end);
     });
   }
   const bool far_offsets = brick_bytes(args.voxel, args.side, args.voxel_width) * args.bricks > INT32_MAX;

@@ -83,11 +83,6 @@ struct UserSums {
   Floats clear{};
   Mask missed{};
   int32_t gradient_requests = 0;  // how many lanes asked for a gradient at the last interval
-
-  GV_HD void begin(int lane, float start_clear, float hit_clear, float* feature_c) {
-    of_lane[lane].begin(0, start_clear, hit_clear, feature_c);
-    clear[lane] = start_clear;
-  }
 };
 template <class Sum>
 GV_HD Sum& sum_of(UserSums<Sum>& sums, int lane) {
@@ -95,7 +90,8 @@ GV_HD Sum& sum_of(UserSums<Sum>& sums, int lane) {
   return sums.of_lane[lane];
 }
 template <class Sum>
-GV_HD void put_sum(UserSums<Sum>& sums, int lane, const Sum& lane_sum) {
+GV_HD void put_lane(UserSums<Sum>& sums, int lane, const Sum& lane_sum) {
+  sums.of_lane[lane] = lane_sum;
   sums.clear[lane] = lane_sum.clear;
   set_lane(sums.missed, lane, lane_sum.missed);
 }
@@ -156,7 +152,7 @@ struct CalledShader : Kind<T> {
     }
     Sum& sum = sum_of(sums, lane);
     Base::add(piece, probe, sum);
-    put_sum(sums, lane, sum);
+    put_lane(sums, lane, sum);
   }
 #endif
 };

@@ -21,16 +21,23 @@ struct DeepLanes {
     for (int axis = 0; axis < 3; ++axis) origin[lane][axis] = ray.exact_origin(axis);
   }
 
-  // See PacketWalk::move_to.
+  // The lane's position at distance t of a ray.
+  GV_HD Vec3<double> along(int lane, const Vec3<float>& direction, float t) const {
+    Vec3<double> position;
+    for (int axis = 0; axis < 3; ++axis) {
+      position[axis] = origin[lane][axis] + static_cast<double>(t) * static_cast<double>(direction[axis]);
+    }
+    return position;
+  }
+  // See PacketPath::move_to.
   GV_CALL Ints move_to(Mask mask, const Vec3<Floats>& direction, Floats t, Ints deepest) {
     Vec3<double> high;
     for (int axis = 0; axis < 3; ++axis) high[axis] = Digits<float>::upper_bound_of(rays, axis);
     for_lanes(mask, [&](int lane) {
       const Digits<float> old_digits = digits(lane);
+      const Vec3<double> position = along(lane, lane_of(direction, lane), t[lane]);
       for (int axis = 0; axis < 3; ++axis) {
-        const double position =
-            origin[lane][axis] + static_cast<double>(t[lane]) * static_cast<double>(direction[axis][lane]);
-        cell[lane][axis] = Digits<float>::cell_at(levels, tree.max_depth, position, high[axis]);
+        cell[lane][axis] = Digits<float>::cell_at(levels, tree.max_depth, position[axis], high[axis]);
       }
       const Digits<float> new_digits = digits(lane);
       int32_t level = deepest[lane];

@@ -5,6 +5,7 @@
 
 #include "packets/deep_lanes.h"
 #include "packets/packet_brick.h"
+#include "shaders/light.h"
 
 namespace gvtorch::GV_NAMESPACE {
 
@@ -14,13 +15,13 @@ struct PacketPath {
   uint8_t* const hidden_tn;  // see kUnknown in walk.h; nullptr: hidden nodes differ from ray to ray
   const int32_t slot_bytes;  // PacketBrick::brick of slot 1
   const int32_t frame;
+  const int32_t lengths;  // of intervals: how many there are
 
-  // Rays.
-  int64_t numbers[kLanes];
-  Ray<Floats> ray;
-  Sight<Floats> sight;
-  Intervals<Floats> intervals;
-  Ints wanted;
+  // The ray that a lane follows. Lanes without one may hold any numbers.
+  Ray<Floats> ray{};
+  Sight<Floats> sight{};
+  Intervals<Floats> intervals{};
+  Ints wanted{};
 
   // The last descent: the node of each level, negative (bit 31 is set) where it is hidden.
   Vec3<Ints> cell{};
@@ -29,50 +30,44 @@ struct PacketPath {
   Ints path_node[kMaxLevels], path_brick[kMaxLevels], path_tile[kMaxLevels];
 
   // The visit that a lane is in.
-  Floats number;  // of the next interval
-  Extent<Floats> extent;
-  Floats voxel, blend_scale;
-  Mask mixed;
-  PacketBrick fine, coarse;
-  Ints fine_depth, coarse_depth;
+  Floats number{};  // of the next interval
+  Extent<Floats> extent{};
+  Floats voxel{}, blend_scale{};
+  Mask mixed{};
+  PacketBrick fine{}, coarse{};
+  Ints fine_depth{}, coarse_depth{};
 
-  PacketPath(const Walk<float>& walk, const Channels& tree_channels, uint8_t* hidden_tn, int32_t slot_bytes)
+  PacketPath(const Walk<float>& walk, const Channels& tree_channels, uint8_t* hidden_tn, int32_t slot_bytes,
+             int32_t lengths)
       : walk(walk),
         tree_channels(tree_channels),
         hidden_tn(hidden_tn),
         slot_bytes(slot_bytes),
         frame(*walk.frame_1),
-        deep_lanes(walk.rays, walk.tree, walk.levels) {}
-
-  // Loads the rays at positions begin to end of the order, at most kLanes; returns the lanes that have one.
-  GV_CALL Mask load(int64_t begin, int64_t end, int32_t lengths) {
-    Mask loaded{};
-    wanted = mixed = fine_depth = coarse_depth = Ints{};
-    number = voxel = blend_scale = Floats{};
-    extent = Extent<Floats>{};
-    fine = coarse = PacketBrick{};
-    ray = Ray<Floats>{};
-    intervals = Intervals<Floats>{};
-    intervals.step = walk.step;
-    intervals.top = lengths - 1;
-    intervals.length = broadcast<Floats>(intervals.step);
-    intervals.inverse_length = 1.0f / intervals.length;
+        lengths(lengths),
+        deep_lanes(walk.rays, walk.tree, walk.levels) {
     for (int axis = 0; axis < 3; ++axis) ray.upper_bound[axis] = Ray<Floats>::upper_bound_of(walk.rays, axis);
-    for (int lane = 0; lane < kLanes; ++lane) {
-      numbers[lane] = begin + lane < end ? walk.order(begin + lane) : -1;
-      if (numbers[lane] < 0) continue;
-      const Ray<float> lane_ray(walk.rays, numbers[lane]);
-      put_lane(ray, lane, lane_ray);
-      if (walk.rays.deep) deep_lanes.begin(lane, lane_ray);
-      put_lane(sight, lane, Sight<float>(walk.rays, numbers[lane], lane_ray.moved));
-      intervals.cone_near[lane] = lane_ray.cone_near;
-      intervals.cone_growth[lane] = lane_ray.cone_growth;
-      intervals.start[lane] = intervals.base[lane] = lane_ray.first;
-      intervals.stop[lane] = lane_ray.last;
-      loaded[lane] = -1;
-    }
-    intervals.choose_level(loaded);
-    return loaded;
+  }
+
+  // Begins a ray in a lane.
+  GV_CALL void begin_ray(int lane, int64_t ray_number) {
+    const Ray<float> lane_ray(walk.rays, ray_number);
+    put_ray(lane, lane_ray, {walk.rays, ray_number, lane_ray.moved}, {lane_ray, walk.step, lengths});
+  }
+  // Begins a cone in a lane, see ShadeRay::share_of_light; it lies on the ray of a lane of another packet.
+  GV_CALL void begin_cone(int lane, const LightCone<float>& cone, const PacketPath& from, int from_lane) {
+    const Vec3<float> origin = lane_of(from.ray.origin, from_lane), direction = lane_of(from.ray.direction, from_lane);
+    Vec3<double> position;
+    for (int axis = 0; axis < 3; ++axis) position[axis] = origin[axis] + cone.t * direction[axis];
+    if (walk.rays.deep) position = from.deep_lanes.along(from_lane, direction, cone.t);
+    Vec3<float> cube;
+    for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<float>(walk.rays.place_33[3 + axis]);
+    const float cone_near = from.intervals.cone_near[from_lane] + from.intervals.cone_growth[from_lane] * cone.t;
+    const float cone_growth = cone.growth * static_cast<float>(walk.rays.cone_scale);
+    const Ray<float> beam(walk.rays, position, cone.direction, cube, cone_near, cone_growth, cone.length);
+    Intervals<float> beam_intervals(beam, walk.step, lengths);
+    beam_intervals.move_to(true, beam_intervals.count + 1);
+    put_ray(lane, beam, {take_lane<Sight<float>>(from.sight, from_lane).at(cone.t), cone.direction}, beam_intervals);
   }
 
   // What lanes see in the nodes that they have come to.
@@ -207,6 +202,15 @@ struct PacketPath {
   virtual bool hides(int32_t node) const = 0;
 
  private:
+  GV_HD void put_ray(int lane, const Ray<float>& lane_ray, const Sight<float>& lane_sight,
+                     const Intervals<float>& lane_intervals) {
+    put_lane(ray, lane, lane_ray);
+    put_lane(sight, lane, lane_sight);
+    put_lane(intervals, lane, lane_intervals);
+    number[lane] = lane_intervals.count;
+    if (walk.rays.deep) deep_lanes.begin(lane, lane_ray);
+  }
+
   // The same as `descend` in tree.h, level by level for all lanes; those whose path is known to a deeper level wait.
   template <class HiddenFrom>
   GV_HD void descend(Mask mask, Floats middle, const HiddenFrom& hidden_from, Ints& depth, Ints& node, Ints& brick,

@@ -13,15 +13,11 @@
 
 namespace gvtorch::GV_NAMESPACE {
 
-// A lane's Sum of those of all lanes, and back. UserSums, which keeps a Sum for each lane, has overloads, see
-// user_shader.h.
+// A lane's Sum of those of all lanes; put_lane puts it back. UserSums, which keeps a Sum for each lane, has overloads
+// of both, see user_shader.h.
 template <class Sum, class Sums>
 GV_HD Sum sum_of(const Sums& sums, int lane) {
   return take_lane<Sum>(sums, lane);
-}
-template <class Sums, class Sum>
-GV_HD void put_sum(Sums& sums, int lane, const Sum& lane_sum) {
-  put_lane(sums, lane, lane_sum);
 }
 // The lanes of `mask` in which no value between low and high changes the sum.
 template <class Shader, class Sums>
@@ -33,14 +29,22 @@ struct PacketChannels {
   const PacketChannel value, normal, other;
 };
 
-// The walk of a packet, and the probe (see probe.h) of its lanes that march. Values: TypedValues or AnyValues.
-template <class Shader, class Values>
+// See packet_shadows.h.
+template <class Kernel, class Values>
+struct PacketShadows;
+struct NoShadows {
+  template <class... Arguments>
+  explicit NoShadows(const Arguments&...) {}
+};
+
+// The walk of a packet, and the probe (see probe.h) of its lanes that march. Kernel: the ShadeRay that traces one ray
+// alone. Shader: the kernel's, or its ShadowShader for cones to the light. Values: TypedValues or AnyValues.
+template <class Kernel, class Values, class Shader = typename Kernel::Shader>
 struct PacketWalk : PacketPath {
   using Number = Floats;
-  using Kernel = ShadeRay<float, Shader, BitDigits, false, typename Values::Voxel>;
   using RayProbe = typename Kernel::RayProbe;
   using Sum = typename Shader::Sum;
-  static constexpr bool kEnds = Shader::kEnds;
+  static constexpr bool kEnds = Shader::kEnds, kShadowed = Kernel::kShadows && !Shader::kToLight;
 
   const Kernel& kernel;
   const Shader& shader;
@@ -49,38 +53,72 @@ struct PacketWalk : PacketPath {
   const int64_t packet_bricks;
   const float stop_clear;
 
-  Mask alive;
+  int64_t numbers[kLanes];  // of the rays, or of the cones to the light, in the lanes; -1: none
+  Mask alive{};
   typename Shader::template SumOf<Floats> sum;
-  Ints samples;
+  Ints samples{};
 
   // The run of intervals that a lane is in.
-  Mask marching;  // lanes whose values are read
-  Ints remaining;
-  Floats last_value;  // value at the end of the last interval
+  Mask marching{};  // lanes whose values are read
+  Ints remaining{};
+  Floats last_value{};  // value at the end of the last interval
 
-  PacketWalk(const Kernel& kernel, const Values& values, const ShadeArgs& args)
-      : PacketPath(kernel, kernel.channels, Kernel::kHidesAlike ? args.hidden_tn : nullptr, values.slot_bytes()),
+  std::conditional_t<kShadowed, PacketShadows<Kernel, Values>, NoShadows> shadows;
+
+  PacketWalk(const Kernel& kernel, const Shader& shader, const Values& values, const ShadeArgs& args, float stop_clear)
+      : PacketPath(kernel, kernel.channels, Kernel::kHidesAlike ? args.hidden_tn : nullptr, values.slot_bytes(),
+                   kernel.lengths),
         kernel(kernel),
-        shader(kernel.shader),
+        shader(shader),
         values(values),
         channels{{kernel.channels.value, args.side, args.bricks},
                  {kernel.channels.normal, args.side, args.bricks},
                  {kernel.channels.other, args.side, args.bricks}},
         packet_bricks(args.packet_bricks),
-        stop_clear(kernel.stop_clear) {}
+        stop_clear(stop_clear),
+        shadows(kernel, values, args) {}
 
-  // Traces the rays at positions begin to end of the order, at most kLanes.
+  // Traces the rays at positions begin to end of the order.
   GV_HD void trace(int64_t begin, int64_t end) {
-    begin_rays(begin, end);
-    while (any(alive)) {
-      const Mask waiting = alive & (remaining == 0);
-      if (any(waiting)) advance(waiting);
-      Mask ready = alive & (remaining > 0);
-      const int32_t enough = count(alive) / 2 + 1;
-      while (count(ready) >= enough) ready = march(ready);
-    }
-    for (int lane = 0; lane < kLanes; ++lane) {
-      if (numbers[lane] >= 0) end_ray(lane);
+    const auto begin_lane = [&](int lane, int64_t position) {
+      const int64_t ray_number = walk.order(position);
+      if (ray_number < 0) return ray_number;
+      begin_ray(lane, ray_number);
+      Sum lane_sum;
+      float* const feature_c = kernel.features_rc + ray_number * kernel.features;
+      for (int32_t c = 0; c < kernel.features; ++c) feature_c[c] = 0;
+      lane_sum.begin(0, static_cast<float>(walk.rays.clear(ray_number)), kernel.hit_clear, feature_c);
+      put_lane(sum, lane, lane_sum);
+      return ray_number;
+    };
+    follow(begin, end, begin_lane, [&](int lane) { end_ray(lane); });
+  }
+
+  // Follows items, numbers `next` to end - 1, to their ends, kLanes at a time. begin_lane(lane, item) begins an item in
+  // a lane and returns what `numbers` is to hold there: -1 where there is nothing to follow, and the lane takes the
+  // next item. end_lane(lane) is called for all others at the end.
+  template <class Begin, class End>
+  GV_HD void follow(int64_t next, int64_t end, const Begin& begin_lane, const End& end_lane) {
+    while (next < end) {
+      for (int lane = 0; lane < kLanes; ++lane) {
+        numbers[lane] = -1;
+        while (numbers[lane] < 0 && next < end) numbers[lane] = begin_lane(lane, next++);
+        set_lane(alive, lane, numbers[lane] >= 0);
+      }
+      alive = alive & intervals.inside() & (sum.clear > stop_clear);
+      remaining = samples = Ints{};
+      last_value = Floats{};
+      while (any(alive)) {
+        const Mask waiting = alive & (remaining == 0);
+        if (any(waiting)) advance(waiting);
+        Mask ready = alive & (remaining > 0);
+        const int32_t enough = count(alive) / 2 + 1;
+        while (count(ready) >= enough) ready = march(ready);
+      }
+      if constexpr (kShadowed) shadows.add_all(*this);
+      for (int lane = 0; lane < kLanes; ++lane) {
+        if (numbers[lane] >= 0) end_lane(lane);
+      }
     }
   }
 
@@ -147,21 +185,6 @@ struct PacketWalk : PacketPath {
   }
 
  private:
-  using Visitor = typename Kernel::template Visitor<Shader>;
-
-  GV_HD void begin_rays(int64_t begin, int64_t end) {
-    alive = load(begin, end, kernel.lengths);
-    remaining = samples = Ints{};
-    last_value = Floats{};
-    sum = {};
-    for_lanes(alive, [&](int lane) {
-      float* feature_c = kernel.features_rc + numbers[lane] * kernel.features;
-      for (int32_t c = 0; c < kernel.features; ++c) feature_c[c] = 0;
-      sum.begin(lane, static_cast<float>(walk.rays.clear(numbers[lane])), kernel.hit_clear, feature_c);
-    });
-    alive = alive & intervals.inside() & (sum.clear > stop_clear);
-  }
-
   GV_HD void end_ray(int lane) {
     auto&& lane_sum = sum_of<Sum>(sum, lane);
     if constexpr (Shader::kSurface) {
@@ -195,7 +218,7 @@ struct PacketWalk : PacketPath {
     const Found found = find_nodes(mask);
     sum.missed = sum.missed | found.lacking;
     if (any(found.shown)) {
-      Mask flat = kernel.shades_each_position() ? Mask{} : found.uniform;
+      Mask flat = kernel.template shades_each_position<Shader>() ? Mask{} : found.uniform;
       each_lane(flat & mixed, [&](int lane, const Probe<float>& probe) { set_lane(flat, lane, probe.uniform()); });
       const Mask runs = found.shown & ~flat;
       if (any(runs)) begin_run(runs);
@@ -249,7 +272,7 @@ struct PacketWalk : PacketPath {
     piece.value = piece.front = piece.back = fine.constant;
     samples = samples - mask;
     marching = mask;
-    shader.add(mask, piece, *this, sum);
+    add(mask, piece);
   }
 
   // Takes one interval in all lanes that march; returns those whose run goes on. So that the next sample never waits
@@ -272,18 +295,40 @@ struct PacketWalk : PacketPath {
     }
     const Mask seeing = mask & (sum.clear > stop_clear);
     samples = samples - seeing;
-    shader.add(seeing, piece, *this, sum);
+    add(seeing, piece);
     return mask & (remaining > 0);
   }
 
+  GV_HD void add(Mask mask, const Piece<Floats>& piece) {
+    if constexpr (kShadowed) {
+      const auto add_lit = [&](Mask shown, const LitPoint<Floats>& point, const LightCone<Floats>& cone,
+                               const Piece<Floats>& lit_piece) {
+        shadows.put(shown, point, cone, *this);
+        sum.absorb(point.base.alpha, lit_piece, shown);
+      };
+      shader.add(mask, piece, *this, sum, add_lit);
+    } else {
+      shader.add(mask, piece, *this, sum);
+    }
+  }
+
   __attribute__((noinline)) void march_alone(Mask mask) {
+    if constexpr (kShadowed) shadows.add_all(*this);
     each_lane(mask, [&](int lane, const RayProbe& probe) {
       auto lane_intervals = take_lane<Intervals<float>>(intervals, lane);
       const Extent<float> lane_extent{extent.exit[lane], extent.cone_low[lane], extent.cone_high[lane]};
       auto&& lane_sum = sum_of<Sum>(sum, lane);
-      Visitor visitor{kernel, shader, nullptr, nullptr, lane_sum};
+      const auto shadow = [&](const auto&, const LightCone<float>& cone, int32_t&) {
+        if constexpr (kShadowed) {
+          const float share = shadows.share_of(lane, cone, *this);
+          lane_sum.missed = lane_sum.missed || sum.missed[lane] != 0;
+          return share;
+        }
+      };
+      typename Kernel::template Visitor<Shader, std::decay_t<decltype(shadow)>> visitor{kernel, shader, nullptr,
+                                                                                        lane_sum, shadow};
       kernel.march(lane_extent, lane_intervals, visitor, probe);
-      put_sum(sum, lane, lane_sum);
+      put_lane(sum, lane, lane_sum);
       put_lane(intervals, lane, lane_intervals);
       samples[lane] += visitor.samples;
       number[lane] = lane_intervals.count;
@@ -331,12 +376,13 @@ struct PacketWalk : PacketPath {
 };
 
 // Traces the rays at positions begin to end of the order.
-template <class Shader, class Values>
+template <class Shader, class Values, bool kShadows = false>
 void trace_packets(const ShadeArgs& args, int64_t begin, int64_t end) {
-  const typename PacketWalk<Shader, Values>::Kernel kernel(args);
+  using Kernel = ShadeRay<float, Shader, BitDigits, kShadows, typename Values::Voxel>;
+  const Kernel kernel(args);
   const Values values(kernel.channels.value, args.side, args.component, args.bricks);
-  PacketWalk<Shader, Values> packet(kernel, values, args);
-  for (int64_t index = begin; index < end; index += kLanes) packet.trace(index, smaller(index + kLanes, end));
+  PacketWalk<Kernel, Values> packet(kernel, kernel.shader, values, args, kernel.stop_clear);
+  packet.trace(begin, end);
 }
 
 }  // namespace gvtorch::GV_NAMESPACE

@@ -59,6 +59,26 @@ GV_HD Moments<T> combined(const Moments<T>& a, const Moments<T>& b, const F& f) 
   return {f(a.xx, b.xx), f(a.xy, b.xy), f(a.xz, b.xz), f(a.yy, b.yy), f(a.yz, b.yz), f(a.zz, b.zz)};
 }
 
+// A position as the light finds it, if nothing lies between.
+template <class V>
+struct LitPoint {
+  Row<V> base;          // its colour, and an interval's alpha
+  V facing, highlight;  // factors of its diffuse and specular light
+  V cosine;             // of the angle between the ray and the direction to the light
+
+  GV_EACH_MEMBER(Row<V>::each_member(a.base, b.base, body); GV_BOTH(facing) GV_BOTH(highlight) GV_BOTH(cosine))
+};
+
+// A cone from distance t of a ray to the light.
+template <class V>
+struct LightCone {
+  V t;
+  Vec3<V> direction;
+  V length, growth;  // distance to the light; how much the cone grows per unit of length
+
+  GV_EACH_MEMBER(GV_BOTH(t) GV_BOTH(direction) GV_BOTH(length) GV_BOTH(growth))
+};
+
 // Blinn-Phong, on both sides of a surface; or the light that a medium scatters.
 template <class T>
 struct Light {
@@ -94,17 +114,11 @@ struct Light {
     for (int axis = 0; axis < 3; ++axis) n[axis] = select(faces_away, -n[axis], n[axis]);
     return n;
   }
-  // Direction and distance to the light, and how much cones to the light grow per unit of length.
-  template <class V>
-  struct LightCone {
-    Vec3<V> direction;
-    V length, growth;
-  };
   template <class AnyProbe, class V = typename AnyProbe::Number>
-  GV_HD LightCone<V> towards(const AnyProbe& probe, typename AnyProbe::Number t) const {
+  GV_HD LightCone<V> cone_from(const AnyProbe& probe, typename AnyProbe::Number t) const {
     const Parameters<T>& p = *parameters;
     const Vec3<V> d = probe.sight.direction;
-    LightCone<V> cone{{-d.x, -d.y, -d.z}, broadcast<V>(static_cast<T>(INFINITY)), broadcast<V>(p.light_width)};
+    LightCone<V> cone{t, {-d.x, -d.y, -d.z}, broadcast<V>(static_cast<T>(INFINITY)), broadcast<V>(p.light_width)};
     if (kind() == LightKind::kDirectional) {
       for (int axis = 0; axis < 3; ++axis) cone.direction[axis] = broadcast<V>(-p.light_vector[axis]);
       cone.direction = unit(cone.direction);
@@ -119,30 +133,53 @@ struct Light {
     }
     return cone;
   }
-  // Lit colour of a position. Without a normal (n is 0), it is lit as if it faced the light, without a highlight.
-  template <class AnyProbe, class V = typename AnyProbe::Number, class... Shadow>
-  GV_HD Row<V> shade(Row<typename AnyProbe::Number> base, Vec3<typename AnyProbe::Number> n, const AnyProbe& probe,
-                     typename AnyProbe::Number t, const Shadow&... shadow) const {
-    const Parameters<T>& p = *parameters;
-    const Vec3<V> d = probe.sight.direction;
-    const auto [to_light, length, growth] = towards(probe, t);
-    V facing = broadcast<V>(static_cast<T>(1)), highlight{};
+  // A position seen along d. Without a normal (n is 0), it is lit as if it faced the light, without a highlight.
+  template <class V>
+  GV_HD LitPoint<V> point_of(const Row<V>& base, const Vec3<V>& n, const Vec3<V>& d, const Vec3<V>& to_light) const {
+    LitPoint<V> point{base, broadcast<V>(static_cast<T>(1)), V{}, dot(d, to_light)};
     const MaskOf<V> has_normal = dot(n, n) > 0;
     if (any(has_normal)) {
-      facing = select(has_normal, larger(V{}, dot(n, to_light)), facing);
+      point.facing = select(has_normal, larger(V{}, dot(n, to_light)), point.facing);
       const Vec3<V> half_vector = unit(minus(to_light, d));
-      const MaskOf<V> faces = has_normal && facing > 0;
-      if (any(faces)) highlight = select(faces, power_of(larger(V{}, dot(n, half_vector)), p.shininess), highlight);
-    }
-    if constexpr (sizeof...(shadow) > 0) {
-      if (facing > 0 && kind() != LightKind::kHeadlight) {
-        const T share = (shadow(t, to_light, length, growth), ...);
-        if (scatters()) return scattered(base, dot(d, to_light), share);
-        facing = facing * share;
-        highlight = highlight * share;
+      const MaskOf<V> faces = has_normal && point.facing > 0;
+      if (any(faces)) {
+        const V highlight = power_of(larger(V{}, dot(n, half_vector)), parameters->shininess);
+        point.highlight = select(faces, highlight, point.highlight);
       }
     }
-    return lit(base, facing, highlight);
+    return point;
+  }
+  // Lit colour of a position without shadows.
+  template <class AnyProbe, class V = typename AnyProbe::Number>
+  GV_HD Row<V> shade(const Row<typename AnyProbe::Number>& base, const Vec3<typename AnyProbe::Number>& n,
+                     const AnyProbe& probe, typename AnyProbe::Number t) const {
+    const LitPoint<V> point = point_of(base, n, probe.sight.direction, cone_from(probe, t).direction);
+    return lit(base, point.facing, point.highlight);
+  }
+  // True where a position's colour depends on how much light reaches it.
+  template <class V>
+  GV_HD MaskOf<V> receives(const LitPoint<V>& point) const {
+    return kind() == LightKind::kHeadlight ? MaskOf<V>{} : point.facing > 0;
+  }
+  // Lit colour of a position that `share` of the light reaches.
+  template <class V>
+  GV_HD Row<V> in_shadow(const LitPoint<V>& point, V share) const {
+    if (scatters() && kind() != LightKind::kHeadlight) return scattered(point.base, point.cosine, share);
+    return lit(point.base, point.facing * share, point.highlight * share);
+  }
+  // Adds an interval, lit; with shadows, `shadow(mask, point, cone, piece)` adds it, by `in_shadow`.
+  template <class V, class AnyProbe, class... Shadow>
+  GV_HD void add(MaskOf<V> mask, const Row<V>& base, const AnyProbe& probe, const Piece<V>& piece, ShadeSum<V>& sum,
+                 const Shadow&... shadow) const {
+    const Vec3<V> n = normal(probe, piece.middle);
+    const LightCone<V> cone = cone_from(probe, piece.middle);
+    const LitPoint<V> point = point_of(base, n, probe.sight.direction, cone.direction);
+    sum.add_normal(n, sum.clear * base.alpha, mask);
+    if constexpr (sizeof...(shadow) > 0) {
+      (shadow(mask, point, cone, piece), ...);
+    } else {
+      sum.add(lit(base, point.facing, point.highlight), piece, mask);
+    }
   }
   // Lights a base colour by the factors of its diffuse (`facing`) and specular (`highlight`) light.
   template <class V>
@@ -173,7 +210,7 @@ struct Light {
     const V share = clamp(static_cast<T>(kFaint) * total, zero, one), divisor = select(total > 0, total, unity);
     m = {m.xx / divisor, m.xy / divisor, m.xz / divisor, m.yy / divisor, m.yz / divisor, m.zz / divisor};
     const V square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + two * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
-    const Vec3<V> to_light = towards(probe, t).direction;
+    const Vec3<V> to_light = cone_from(probe, t).direction;
     normal = m.times(d);
     for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
     const V seen_rms = square_root(larger(V{}, -dot(d, normal)));
@@ -205,13 +242,14 @@ struct Light {
   // Colour of a position in a medium, from the share of light that reaches it unscattered (`clear`). The first octave
   // is single scattering; the others approximate more and more scatterings: each has half the optical depth of the one
   // before, is weaker, more coloured and less directed.
-  GV_HD Row<T> scattered(Row<T> base, T cosine, T clear) const {
+  template <class V>
+  GV_HD Row<V> scattered(const Row<V>& base, V cosine, V clear) const {
     const Parameters<T>& p = *parameters;
-    const T albedo[3] = {base.red, base.green, base.blue};
-    T weight[3] = {albedo[0], albedo[1], albedo[2]}, sum[3] = {};
+    const V albedo[3] = {base.red, base.green, base.blue};
+    V weight[3] = {albedo[0], albedo[1], albedo[2]}, sum[3] = {};
     T g = p.anisotropy;
     for (T octave = 0; octave < p.octaves; octave = octave + 1) {
-      const T share = phase(g, cosine) * clear;
+      const V share = phase(g, cosine) * clear;
       for (int i = 0; i < 3; ++i) {
         sum[i] = sum[i] + weight[i] * share;
         weight[i] = weight[i] * (albedo[i] * albedo[i]) * static_cast<T>(kOctaveLight);
@@ -223,9 +261,10 @@ struct Light {
     return {lit(0), lit(1), lit(2), base.alpha};
   }
   // The Henyey-Greenstein phase function, scaled to a mean of 1 over all directions.
-  GV_HD static T phase(T g, T cosine) {
+  template <class V>
+  GV_HD static V phase(T g, V cosine) {
     const T square = g * g;
-    const T base = 1 + square - 2 * g * cosine;
+    const V base = 1 + square - 2 * g * cosine;
     return (1 - square) / (base * square_root(base));
   }
   // The transmittance at which rays to the light end: so small because the last octave uses a root of it.

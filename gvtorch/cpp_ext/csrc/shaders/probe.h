@@ -118,7 +118,7 @@ struct Sight {
   T moved;  // distance from the camera to where t counts from
 
   Sight() = default;
-  GV_HD Sight(Vec3<T> origin, Vec3<T> direction) : origin(origin), direction(direction), moved(0) {}
+  GV_HD Sight(Vec3<T> origin, Vec3<T> direction) : origin(origin), direction(direction), moved{} {}
   GV_HD Sight(const RayView& rays, int64_t index, T moved) : moved(moved) {
     for (int axis = 0; axis < 3; ++axis) {
       origin[axis] = static_cast<T>(rays.origin_r3[3 * index + axis]);

@@ -15,8 +15,10 @@
 namespace gvtorch::GV_NAMESPACE {
 
 // Digits: see `with_digits`. Voxel: dtype of the shader's value; void: known at run time only.
-template <class T, class Shader, class Digits, bool kShadows = false, class Voxel = void>
+template <class T, class Kind, class Digits, bool kWithShadows = false, class Voxel = void>
 struct ShadeRay : Walk<T> {
+  using Shader = Kind;
+  static constexpr bool kShadows = kWithShadows;
   using RayProbe = ProbeOf<T, Voxel>;
   using Walk<T>::tree;
   using Walk<T>::step;
@@ -64,7 +66,10 @@ struct ShadeRay : Walk<T> {
     sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
     for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
     const auto& ready = ready_for_ray(shader);
-    Visitor<std::decay_t<decltype(ready)>> visitor{*this, ready, &ray, &sight, sum};
+    const auto shadow = [&](const auto& probe, const LightCone<T>& cone, int32_t& samples) {
+      return share_of_light(ray, probe, cone, samples, sum.missed);
+    };
+    Visitor<std::decay_t<decltype(ready)>, std::decay_t<decltype(shadow)>> visitor{*this, ready, &sight, sum, shadow};
     this->template follow<Digits>(ray, intervals, visitor);
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
@@ -137,19 +142,26 @@ struct ShadeRay : Walk<T> {
     for (int axis = 0; axis < 3; ++axis) normal_r3[3 * number + axis] = normal[axis];
   }
 
-  // True if light varies in a node of one value: a point light shines on a stored normal from different directions.
-  GV_HD bool shades_each_position() const { return channels.normal.exists() && light.kind() == LightKind::kPoint; }
-
-  // See Walk::follow. AnyShader: the shader, or its ShadowShader for a ray to a light.
+  // True if light varies in a node of one value, or it has to be taken in many intervals. AnyShader: the shader, or
+  // its ShadowShader for a ray to a light.
   template <class AnyShader>
+  GV_HD bool shades_each_position() const {
+    if constexpr (!AnyShader::kToLight && kShadows) return true;
+    if (AnyShader::kToLight && light.scatters()) return true;  // 1 - alpha of a long interval would round to 0
+    return channels.normal.exists() && light.kind() == LightKind::kPoint;  // from a direction that varies
+  }
+
+  // See Walk::follow. AnyShader: as above. Shadow: traces a cone to the light, see share_of_light; called only
+  // with kShadows.
+  template <class AnyShader, class Shadow = std::nullptr_t>
   struct Visitor {
     static constexpr bool kSeesEmpty = AnyShader::kSeesEmpty, kEnds = AnyShader::kEnds;
-    static constexpr bool kToLight = AnyShader::kToLight, kShadowed = kShadows && !kToLight;
+    static constexpr bool kToLight = AnyShader::kToLight;
     const ShadeRay& kernel;
     const AnyShader& shader;
-    const Ray<T>* ray;
     const Sight<T>* sight;
     typename AnyShader::Sum& sum;
+    Shadow shadow{};
     int32_t samples = 0;
 
     GV_HD bool& missed() { return sum.missed; }
@@ -167,9 +179,8 @@ struct ShadeRay : Walk<T> {
     GV_HD RayProbe enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return RayProbe(kernel.channels, *sight, kernel.rays, ray, visit, digits);
     }
-    GV_HD bool uniform(const RayProbe& probe) const {         // with shadows, light varies in it
-      if (kToLight && kernel.light.scatters()) return false;  // 1 - alpha of a long interval would round to 0
-      return !kShadowed && probe.uniform() && !kernel.shades_each_position();
+    GV_HD bool uniform(const RayProbe& probe) const {
+      return probe.uniform() && !kernel.template shades_each_position<AnyShader>();
     }
     GV_HD void region(const RayProbe& probe, T start, T end) {
       Piece<T> piece;
@@ -238,10 +249,12 @@ struct ShadeRay : Walk<T> {
     }
     template <class ActiveShader>
     GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
-      if constexpr (kShadowed) {
-        active_shader.add(true, piece, probe, sum, [&](T t, Vec3<T> direction, T length, T growth) {
-          return kernel.share_of_light(*ray, probe, t, direction, length, growth, samples, sum.missed);
-        });
+      if constexpr (kShadows && !kToLight) {
+        const auto add_lit = [&](bool, const LitPoint<T>& point, const LightCone<T>& cone, const Piece<T>& piece) {
+          const T share = kernel.light.receives(point) ? shadow(probe, cone, samples) : static_cast<T>(1);
+          sum.add(kernel.light.in_shadow(point, share), piece);
+        };
+        active_shader.add(true, piece, probe, sum, add_lit);
       } else {
         active_shader.add(true, piece, probe, sum);
       }
@@ -249,21 +262,21 @@ struct ShadeRay : Walk<T> {
   };
 
  private:
-  // Share of the light from `length` away that reaches the position at distance t. The cone to the light begins as wide
-  // as the ray's is there; its first interval is left out, so that a position does not shadow itself.
-  GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, T t, Vec3<T> direction, T length, T growth,
-                         int32_t& samples, bool& missed) const {
+  // Share of the light that reaches the position at the tip of a cone. The cone begins as wide as the ray's is there;
+  // its first interval is left out, so that a position does not shadow itself.
+  GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, const LightCone<T>& cone, int32_t& samples,
+                         bool& missed) const {
     const RayView& rays = this->rays;
-    const Vec3<double> position = ray.along(t, Digits::kDeep && rays.deep);
-    const Ray<T> beam(rays, position, direction, probe.cube, ray.cone_near + ray.cone_growth * t,
-                      growth * static_cast<T>(rays.cone_scale), length);
-    const Sight<T> sight(probe.sight.at(t), direction);
+    const Vec3<double> position = ray.along(cone.t, Digits::kDeep && rays.deep);
+    const Ray<T> beam(rays, position, cone.direction, probe.cube, ray.cone_near + ray.cone_growth * cone.t,
+                      cone.growth * static_cast<T>(rays.cone_scale), cone.length);
+    const Sight<T> sight(probe.sight.at(cone.t), cone.direction);
     Intervals<T> intervals(beam, step, lengths);
     intervals.move_to(true, intervals.count + 1);
     const ShadowShader<T, Shader> shadow_shader{{}, shader};
     typename ShadowShader<T, Shader>::Sum sum;
     sum.stop_clear = light.faintest(this->stop_clear);
-    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &beam, &sight, sum};
+    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &sight, sum};
     this->template follow<Digits>(beam, intervals, visitor);
     samples += visitor.samples;
     missed = missed || sum.missed;

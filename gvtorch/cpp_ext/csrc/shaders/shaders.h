@@ -20,14 +20,13 @@
 //
 // A shader that receives shadows also has
 //
-//   alpha(piece, probe)                           share that an interval absorbs of the light from behind
-//   add(mask, piece, probe, sum, shadow)          `shadow(t, direction, length, growth)`: share of the light that
-//                                                 reaches t
+//   alpha(mask, piece, probe)                     share that an interval absorbs of the light from behind
+//   add(mask, piece, probe, sum, shadow...)       `shadow`: see Light::add
 //
 // T is float or double. `add` is written once for a ray (V is T) and for a packet (V is Floats, see arithmetic.h), in
 // which each lane of `mask` adds an interval; piece, probe and sum are of V. `probe.select_lanes(mask)` limits what is
-// read from then on to fewer lanes, `probe.each_lane(mask, body)` passes each lane's own probe. Everything else is
-// called for one ray.
+// read from then on to fewer lanes, `probe.each_lane(mask, body)` passes each lane's own probe. `alpha` is written once
+// as well. Everything else is called for one ray.
 //
 // An interval belongs to the node that contains its middle. Its ends may lie up to half an interval outside; they are
 // still read in this node, clamped to its brick's outermost voxel centres. With a border of 1 and steps of at most a
@@ -56,20 +55,18 @@ struct Lit : Plain<T> {
 
   explicit Lit(const ShadeArgs& args) : Plain<T>(args), light(args) {}
 
-  GV_HD T alpha(const Piece<T>& piece, const Probe<T>&) const {
-    return look_up(Transfer<T>(transfer), piece.value, piece, step).alpha;
+  template <class V, class AnyProbe>
+  GV_HD V alpha(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe&) const {
+    return look_up(Transfer<T>(transfer), piece.value, piece, step, mask).alpha;
   }
   template <class V, class AnyProbe, class... Shadow>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
-    Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
+    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
     probe.select_lanes(shown);
-    const Vec3<V> n = light.normal(probe, piece.middle);
-    row = light.shade(row, n, probe, piece.middle, shadow...);
-    sum.add_normal(n, sum.clear * row.alpha, shown);
-    sum.add(row, piece, shown);
+    light.add(shown, row, probe, piece, sum, shadow...);
   }
 };
 
@@ -182,16 +179,21 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
 template <class T, class Shader>
 struct ShadowShader : ShaderFacts {
   static constexpr bool kHidesAlike = Shader::kHidesAlike, kToLight = true;
-  struct Sum {
-    T clear = 1;     // transmittance
-    T stop_clear{};  // at which the ray ends
-    bool missed = false;
+  template <class V>
+  struct SumOf {
+    V clear = broadcast<V>(static_cast<T>(1));  // transmittance
+    MaskOf<V> missed{};
+    T stop_clear{};  // transmittance at which the ray ends
+
+    GV_EACH_MEMBER(GV_BOTH(clear) GV_BOTH(missed) GV_BOTH(stop_clear))
   };
+  using Sum = SumOf<T>;
   const Shader& shader;
 
   GV_HD bool hides(T low, T high, const Sum& sum) const { return shader.hides(low, high, sum); }
-  GV_HD void add(bool, const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const {
-    sum.clear = sum.clear * (1 - shader.alpha(piece, probe));
+  template <class V, class AnyProbe>
+  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe, SumOf<V>& sum) const {
+    sum.clear = select(mask, sum.clear * (1 - shader.alpha(mask, piece, probe)), sum.clear);
   }
 };
 

@@ -61,15 +61,16 @@ struct StoredColor : ShaderFacts {
     T premultiplied, lit;  // 1 or 0
   };
   GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
-  template <class AnyProbe>
-  GV_HD T opacity_of(const Piece<T>& piece, const AnyProbe& probe) const {
+  template <class V, class AnyProbe>
+  GV_HD V opacity_of(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
     const auto& channel = probe.channels.value;
-    const auto read = [&](bool, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
-    const T value = channel.width == 4 ? piece.value : of_sides(probe, read);
+    const auto read = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
+    const V value = channel.width == 4 ? piece.value : of_sides<V>(mask, probe, read);
     return saturate(value * numbers().scale);
   }
-  GV_HD T alpha(const Piece<T>& piece, const Probe<T>& probe) const {
-    return stretch(opacity_of(piece, probe), piece.length / numbers().reference_length);
+  template <class V, class AnyProbe>
+  GV_HD V alpha(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
+    return stretch(opacity_of(mask, piece, probe), piece.length / numbers().reference_length);
   }
   template <class V, class AnyProbe, class... Shadow>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
@@ -77,14 +78,14 @@ struct StoredColor : ShaderFacts {
     const auto& channel = probe.channels.value;
     const V t = piece.middle;
     if constexpr (kPacket<V>) {
-      if (channel.width > 4) return add_by_direction(mask, piece, probe, sum);
+      if (channel.width > 4) return add_by_direction(mask, piece, probe, sum, shadow...);
       const auto read = [&](int32_t number) { return probe.number_at(channel, number, t); };
       const auto stored = [&](MaskOf<V>) { return Row<V>{read(0), read(1), read(2), V{}}; };
-      add_stored(mask, saturate(piece.value * numbers().scale), stored, piece, probe, sum);
+      add_stored(mask, saturate(piece.value * numbers().scale), stored, piece, probe, sum, shadow...);
     } else {
       const auto read = [&](bool, int32_t first) { return probe.four_at(true, channel, first, t); };
-      const auto stored = [&](bool) { return channel.width == 4 ? read(true, 0) : of_sides(probe, read); };
-      add_stored(mask, opacity_of(piece, probe), stored, piece, probe, sum, shadow...);
+      const auto stored = [&](bool) { return channel.width == 4 ? read(true, 0) : of_sides<V>(true, probe, read); };
+      add_stored(mask, opacity_of(mask, piece, probe), stored, piece, probe, sum, shadow...);
     }
   }
 
@@ -101,18 +102,15 @@ struct StoredColor : ShaderFacts {
       const V scaled = number * numbers().scale;
       return numbers().premultiplied > 0 ? scaled / opacity : scaled;
     };
-    Row<V> row{color(seen.red), color(seen.green), color(seen.blue),
-               stretch(opacity, piece.length / numbers().reference_length)};
-    if (numbers().lit > 0) {
-      const Vec3<V> n = light.normal(probe, piece.middle);
-      row = light.shade(row, n, probe, piece.middle, shadow...);
-      sum.add_normal(n, sum.clear * row.alpha, shown);
-    }
+    const Row<V> row{color(seen.red), color(seen.green), color(seen.blue),
+                     stretch(opacity, piece.length / numbers().reference_length)};
+    if (numbers().lit > 0) return light.add(shown, row, probe, piece, sum, shadow...);
     sum.add(row, piece, shown);
   }
   // A packet's colours by direction: a call, which keeps the loop of other colours as fast as without these.
-  template <class V, class AnyProbe>
-  GV_RARE void add_by_direction(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
+  template <class V, class AnyProbe, class... Shadow>
+  GV_RARE void add_by_direction(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
+                                const Shadow&... shadow) const {
     const auto& channel = probe.channels.value;
     const Vec3<V> d = probe.sight.direction;
     const V t = piece.middle;
@@ -120,11 +118,11 @@ struct StoredColor : ShaderFacts {
     const auto four = [&](MaskOf<V> lanes, int32_t first) { return probe.four_at(lanes, channel, first, t); };
     const auto stored = [&](MaskOf<V> shown) { return by_direction(shown, d, channel.width, four); };
     add_stored(mask, saturate(by_direction(mask, d, channel.width, number) * numbers().scale), stored, piece, probe,
-               sum);
+               sum, shadow...);
   }
-  template <class AnyProbe, class Read>
-  GV_RARE static auto of_sides(const AnyProbe& probe, const Read& read) {
-    return by_direction(true, probe.sight.direction, probe.channels.value.width, read);
+  template <class V, class AnyProbe, class Read>
+  GV_RARE static auto of_sides(MaskOf<V> mask, const AnyProbe& probe, const Read& read) {
+    return by_direction(mask, probe.sight.direction, probe.channels.value.width, read);
   }
 };
 

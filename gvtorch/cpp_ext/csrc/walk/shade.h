@@ -251,6 +251,12 @@ struct ShadeSum {
     add_light(row, clear, mask);
     absorb(row.alpha, piece, mask);
   }
+  // Adds light in a lane, weighted by `share`.
+  GV_HD void add_light(int lane, const Row<Real>& row, Real share) {
+    set_lane(red, lane, lane_of(red, lane) + share * row.red);
+    set_lane(green, lane, lane_of(green, lane) + share * row.green);
+    set_lane(blue, lane, lane_of(blue, lane) + share * row.blue);
+  }
   GV_HD void add_normal(Vec3<T> n, T share, Mask mask = all_lanes<T>()) {
     for (int axis = 0; axis < 3; ++axis) normal[axis] = select(mask, normal[axis] + share * n[axis], normal[axis]);
   }
@@ -258,13 +264,8 @@ struct ShadeSum {
   GV_EACH_MEMBER(GV_BOTH(red) GV_BOTH(green) GV_BOTH(blue) GV_BOTH(clear) GV_BOTH(depth) GV_BOTH(missed) GV_BOTH(normal)
                      GV_BOTH(hit_clear) GV_BOTH(feature_c))
 
- private:
-  GV_HD void add_light(const Row<T>& row, T share, Mask mask) {
-    red = select(mask, red + share * row.red, red);
-    green = select(mask, green + share * row.green, green);
-    blue = select(mask, blue + share * row.blue, blue);
-  }
-  // Depth is where in the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
+  // Takes the light that an interval absorbs. Depth is where in the interval the transmittance falls to hit_clear, as
+  // if the interval were homogeneous.
   GV_HD void absorb(T alpha, const Piece<T>& piece, Mask mask) {
     const T clear_after = clear * (1 - alpha);
     for_lanes(mask && clear_after < hit_clear && clear >= hit_clear, [&](int lane) {
@@ -272,6 +273,13 @@ struct ShadeSum {
       set_lane(depth, lane, lane_of(piece.start, lane) + fraction * lane_of(piece.length, lane));
     });
     clear = select(mask, clear_after, clear);
+  }
+
+ private:
+  GV_HD void add_light(const Row<T>& row, T share, Mask mask) {
+    red = select(mask, red + share * row.red, red);
+    green = select(mask, green + share * row.green, green);
+    blue = select(mask, blue + share * row.blue, blue);
   }
   // Fraction of an interval after which the transmittance is hit_clear.
   GV_HD static Real hit_fraction(Real clear, Real alpha, Real hit_clear) {
