@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import fcntl
 import importlib.util
 import os
 from collections import Counter
@@ -20,7 +20,7 @@ from gvtorch.viewer.view import new_session
 
 pytest.register_assert_rewrite("helpers")
 from helpers import ABSENT, DATA, DEVICES, browser, gvtorch  # noqa: E402
-from helpers.compiled import quick_compiler  # noqa: E402
+from helpers.compiled import prepared_compiler  # noqa: E402
 from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
@@ -76,12 +76,11 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def quick(cache: Path) -> str:
     """A compiler that does not optimise, shared by all processes so that they share its cache."""
     folder = cache.parent / "quick"
-    if not folder.exists():
-        new_folder = cache.parent / f"quick-{os.getpid()}"
-        new_folder.mkdir()
-        quick_compiler(new_folder)
-        with contextlib.suppress(OSError):  # another process was first
-            new_folder.rename(folder)
+    with cache.with_name("quick.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            folder.mkdir()
+            prepared_compiler(folder)
     return str(folder / "c++")
 
 
