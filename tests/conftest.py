@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import importlib
 import importlib.util
 import os
 from collections import Counter
@@ -19,7 +21,7 @@ from gvtorch.viewer.state import Development
 from gvtorch.viewer.view import new_session
 
 pytest.register_assert_rewrite("helpers")
-from helpers import ABSENT, DATA, DEVICES, browser, gvtorch  # noqa: E402
+from helpers import ABSENT, DATA, DEVICES, TESTS, browser, gvtorch  # noqa: E402
 from helpers.compiled import prepared_compiler  # noqa: E402
 from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
@@ -33,6 +35,18 @@ def pytest_configure(config: pytest.Config) -> None:
         "markers",
         "backend(name): runs on this backend, in OpenGL or a browser; counted in the summary",
     )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Each worker imports a part of the test files first, so that pytest rewrites the assertions
+    of each file once, not once per worker: the others read what it has written.
+    """
+    if hasattr(session.config, "workerinput") and session.config.args == ["tests"]:
+        number, count = (session.config.workerinput[k] for k in ("workerid", "workercount"))
+        for file in sorted(TESTS.glob("test_*.py"))[int(number[2:]) :: count]:
+            with contextlib.suppress(BaseException):  # a skip, or what the collection will report
+                importlib.import_module(file.stem)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
