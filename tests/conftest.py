@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import functools
 import importlib
 import importlib.util
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 
 import gvtorch as gv
 from gvtorch.ops import unavailable
@@ -87,6 +89,17 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("GVTORCH_CACHE", str(folder))
         patch.setenv("TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS", "0")
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def tokens_of_classes() -> Iterator[None]:
+    """Each command tokenizes the sources of its classes for its help, a third of its time before it
+    does anything: in the tests' process, each class is tokenized once.
+    """
+    kind = tyro._docstrings._ClassTokenization
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kind, "make", staticmethod(functools.cache(kind.make)))
+        yield
 
 
 @pytest.fixture(scope="session")
