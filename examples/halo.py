@@ -39,14 +39,14 @@ def streams(stars: int, steps: int = 700, step: float = 0.02) -> torch.Tensor:
     ln(0.1 + x^2 + y^2 + z^2 / 0.8) / 2 (Binney, Tremaine, "Galactic Dynamics", 2008, 2.71)."""
     normal = partial(torch.randn, generator=torch.Generator().manual_seed(6))
     satellite = (40 * torch.linspace(0, 1, stars) ** 2).long().clamp(max=39)  # they differ in size
-    position = 0.4 * normal(40, 3)[satellite] + 0.03 * normal(stars, 3)
-    velocity = 0.5 * normal(40, 3)[satellite] + 0.04 * normal(stars, 3)
-    scale = torch.tensor([1.0, 1.0, 1 / 0.8])
+    position = (0.4 * normal(40, 3)[satellite] + 0.03 * normal(stars, 3)).T.contiguous()
+    velocity = (0.5 * normal(40, 3)[satellite] + 0.04 * normal(stars, 3)).T.contiguous()
+    scale = torch.tensor([[1.0], [1.0], [1 / 0.8]])
     for _ in range(steps):  # leapfrog
         position += 0.5 * step * velocity
-        velocity -= step * scale * position / (0.1 + (scale * position**2).sum(1, keepdim=True))
+        velocity -= step * scale * position / (0.1 + (scale * position**2).sum(0))
         position += 0.5 * step * velocity
-    return position
+    return position.T
 
 
 def star_density(stars: int = 200_000, side: int = 128) -> torch.Tensor:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import functools
+import importlib
 import importlib.util
 import os
 from collections import Counter
@@ -12,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import tyro
 
 import gvtorch as gv
 from gvtorch.ops import unavailable
@@ -19,8 +23,8 @@ from gvtorch.viewer.state import Development
 from gvtorch.viewer.view import new_session
 
 pytest.register_assert_rewrite("helpers")
-from helpers import ABSENT, DATA, DEVICES, browser, gvtorch  # noqa: E402
-from helpers.compiled import quick_compiler  # noqa: E402
+from helpers import ABSENT, DATA, DEVICES, TESTS, browser, gvtorch  # noqa: E402
+from helpers.compiled import prepared_compiler  # noqa: E402
 from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
@@ -33,6 +37,18 @@ def pytest_configure(config: pytest.Config) -> None:
         "markers",
         "backend(name): runs on this backend, in OpenGL or a browser; counted in the summary",
     )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Each worker imports a part of the test files first, so that pytest rewrites the assertions
+    of each file once, not once per worker: the others read what it has written.
+    """
+    if hasattr(session.config, "workerinput") and session.config.args == ["tests"]:
+        number, count = (session.config.workerinput[k] for k in ("workerid", "workercount"))
+        for file in sorted(TESTS.glob("test_*.py"))[int(number[2:]) :: count]:
+            with contextlib.suppress(Exception, pytest.skip.Exception):  # collection reports them
+                importlib.import_module(file.stem)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -64,24 +80,37 @@ def compiled(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A temporary cache folder of compiled shaders: each is compiled once for all tests."""
+    """A temporary cache folder of compiled shaders: each is compiled once for all tests. torch
+    precompiles no header, because the tests compile too few graphs with its default backend.
+    """
     with pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.getbasetemp()
         folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
         patch.setenv("GVTORCH_CACHE", str(folder))
+        patch.setenv("TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS", "0")
         yield folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def tokens_of_classes() -> Iterator[None]:
+    """Each command tokenizes the sources of its classes for its help, a third of its time before it
+    does anything: in the tests' process, each class is tokenized once.
+    """
+    kind = tyro._docstrings._ClassTokenization
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kind, "make", staticmethod(functools.cache(kind.make)))
+        yield
 
 
 @pytest.fixture(scope="session")
 def quick(cache: Path) -> str:
     """A compiler that does not optimise, shared by all processes so that they share its cache."""
     folder = cache.parent / "quick"
-    if not folder.exists():
-        new_folder = cache.parent / f"quick-{os.getpid()}"
-        new_folder.mkdir()
-        quick_compiler(new_folder)
-        with contextlib.suppress(OSError):  # another process was first
-            new_folder.rename(folder)
+    with cache.with_name("quick.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            folder.mkdir()
+            prepared_compiler(folder)
     return str(folder / "c++")
 
 

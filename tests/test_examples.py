@@ -11,7 +11,8 @@ import pytest
 from helpers import ROOT
 from helpers.opengl import IN_OPENGL
 
-SHORT = {"mandelbulb_film": ["--frames", "4"]}  # options that make them short
+# Options that make them short.
+SHORT = {"mandelbulb_film": ["--frames", "4"], "labels": ["--side", "64"]}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 

@@ -7,6 +7,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -43,6 +44,7 @@ def floor(name: str) -> int:
     return next(number for number, rooms in enumerate(FLOORS) if name in rooms)
 
 
+@cache
 def imported(path: Path) -> set[tuple[str, ...]]:
     """Returns the dotted names that a file imports, also inside functions and for type checkers."""
     names: set[tuple[str, ...]] = set()

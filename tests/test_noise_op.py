@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
-from helpers import DEVICES, ROOT
+from helpers import DEVICES
+from helpers.packets import result, start
 
 import gvtorch as gv
 from gvtorch.ops import noise
@@ -61,26 +59,22 @@ def test_what_is_no_number_stays_so(compiled, kind):
     assert noise(points[:0], kind).shape == (0,)
 
 
+def digests() -> list[int]:
+    """Returns those of the noise of each backend and kind."""
+    p = torch.arange(3999, dtype=torch.float32).view(-1, 3) * 0.37109375 - 300
+    return [
+        int((noise(p, kind, backend=backend).view(torch.int32) * 31).sum())
+        for backend in ("cpp", "reference")
+        for kind in twin.KINDS
+    ]
+
+
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.backend("cpp")
-def test_all_instruction_sets_give_the_same_bits(instructions):
+def test_all_instruction_sets_give_the_same_bits(instructions, tmp_path):
     """The other tests use the widest instruction set of the machine."""
-    code = (
-        "import torch; from gvtorch.ops import noise; "
-        "p = torch.arange(3999, dtype=torch.float32).view(-1, 3) * 0.37109375 - 300; "
-        f"print([int((noise(p, kind, backend=b).view(torch.int32) * 31).sum()) "
-        f"for b in ('cpp', 'reference') for kind in {twin.KINDS}])"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "GVTORCH_CPU": instructions, "PYTHONPATH": str(ROOT)},
-    )
-    assert run.returncode == 0, run.stderr
-    digests = eval(run.stdout)
-    assert digests[:6] == digests[6:] and len(set(digests)) == 6
+    actual = result(start(digests, tmp_path, instructions))
+    assert actual[:6] == actual[6:] and len(set(actual)) == 6
 
 
 @dtypes

@@ -10,6 +10,7 @@ from helpers.pictures import GRAY, camera
 from helpers.producers import SIZE, Ball, Sponge
 
 import gvtorch as gv
+from gvtorch.base.rows import distinct_rows
 from gvtorch.producers import Layout
 
 
@@ -25,6 +26,22 @@ def layout(**changes) -> Layout:
         "device": torch.device("cpu"),
     }
     return Layout(**{**options, **changes})
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "shape"),
+    [
+        (-3, 4, (500, 4)),
+        (7, 8, (5, 3)),
+        (0, 1 << 30, (40, 4)),  # their numbers would overflow
+        (0, 9, (0, 4)),
+    ],
+)
+def test_distinct_rows_are_those_of_unique(low, high, shape):
+    rows = torch.randint(low, high, shape, generator=torch.Generator().manual_seed(1))
+    rows = torch.cat((rows, rows.flip(0)))
+    for a, b in zip(distinct_rows(rows), rows.unique(dim=0, return_inverse=True), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_nodes_know_their_place():

@@ -4,16 +4,14 @@ hostile input."""
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from helpers import DEVICES, ROOT
+from helpers import DEVICES
+from helpers.packets import result, start
 from helpers.points import share_below
 from torch import Tensor
 
@@ -128,27 +126,16 @@ def test_each_kind_alone_is_the_twin_and_lists_may_be_empty(compiled, kind):
     assert not splat(*nothing, backend=compiled).any()
 
 
+def splatted() -> Tensor:
+    return splat(*random_arguments(), backend="cpp")
+
+
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.backend("cpp")
 def test_all_instruction_sets_give_the_same_bits(instructions, tmp_path):
     """The other tests use the widest instruction set of the machine."""
-    args = random_arguments()
-    torch.save(list(args), tmp_path / "given.pt")
-    code = (
-        "import torch; from gvtorch.ops import splat; "
-        "torch.save(splat(*torch.load('given.pt'), backend='cpp'), 'found.pt')"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-        env={**os.environ, "GVTORCH_CPU": instructions, "PYTHONPATH": str(ROOT)},
-    )
-    assert run.returncode == 0, run.stderr
-    actual = torch.load(tmp_path / "found.pt")
-    assert torch.equal(bits(actual), bits(splat(*args, backend="reference")))
+    actual = result(start(splatted, tmp_path, instructions))
+    assert torch.equal(bits(actual), bits(splat(*random_arguments(), backend="reference")))
 
 
 def one_point(radius: float, side: int = 8, center: tuple = (0.31, -0.12, 0.07)) -> Arguments:

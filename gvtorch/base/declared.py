@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import functools
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -28,6 +29,7 @@ def declared_texts(module: str, variable: str) -> dict[str, str]:
     return ast.literal_eval(_assigned(module, variable))
 
 
+@functools.cache
 def _assigned(module: str, variable: str) -> ast.expr:
     """Returns the expression that a module assigns to a variable at its top level."""
     path = _PACKAGE.joinpath(*module.split(".")).with_suffix(".py")

@@ -23,6 +23,7 @@ from ..base.constants import (
     REQUEST_SUBDIVIDE,
     TERMINAL,
 )
+from ..base.rows import distinct_rows
 from ..base.volume import movable
 from ..ops import unlink
 from ..pool import BrickPool, N3Tree, NodePool
@@ -235,9 +236,9 @@ class Aliases:
         pairs = torch.stack((rows.node, rows.target), 1) // per_tile
         levels = []
         while len(pairs):
-            pairs = pairs.unique(dim=0)
+            pairs, _ = distinct_rows(pairs)
             levels.append(pairs)
             parent_node = parent[pairs[:, 1]].to(torch.int64)
             pairs = torch.stack((pairs[:, 0], parent_node // per_tile), 1)[parent_node >= 0]
-        alias_tile, path_tile = torch.cat([*levels, pairs]).unique(dim=0).unbind(1)
+        alias_tile, path_tile = distinct_rows(torch.cat([*levels, pairs]))[0].unbind(1)
         return alias_tile, path_tile

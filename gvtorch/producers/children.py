@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.rows import distinct_rows
 from ..base.volume import to_numpy
 from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
@@ -172,7 +173,7 @@ class FromChildren(OfProducers):
         grid = torch.stack(
             torch.broadcast_tensors(x[:, None, None], y[:, None, :, None], z[:, :, None, None]), -1
         )
-        block, block_row = grid.reshape(-1, 3).unique(dim=0, return_inverse=True)
+        block, block_row = distinct_rows(grid.reshape(-1, 3))
         blocks = self._blocks(layout, torch.cat((block, torch.full_like(block[:, :1], depth)), 1))
         inner = (voxel % brick).numpy()
         inner_index = (

@@ -23,6 +23,7 @@ from torch import Tensor
 from ..base import check
 from ..base.boxes import extent_of
 from ..base.constants import MAX_BRANCHING
+from ..base.rows import distinct_rows
 from ..base.volume import Volume, movable
 from ..pool import Channel
 from ..pool.pools import phrase
@@ -395,7 +396,7 @@ class Producer(torch.nn.Module):
         position = torch.minimum(position.clamp(min=0), layout.extent_3 - 1)  # in voxels
         depth = torch.full_like(position[:, :1], layout.depth)
         node_loc = torch.cat(((position / layout.brick_size).floor(), depth), 1).to(torch.int64)
-        loc, row = node_loc.unique(dim=0, return_inverse=True)
+        loc, row = distinct_rows(node_loc)
         bricks_of = self.bricks_at(loc, layout)
         brick_position = position - node_loc[:, :3] * layout.brick_size + layout.border
         values = {}
@@ -410,7 +411,7 @@ class Producer(torch.nn.Module):
         parents = None
         if self.needs_parent and bool((loc[:, 3] > 0).all()):
             parent_loc = torch.cat((loc[:, :3] // layout.branching, loc[:, 3:] - 1), 1)
-            parent_loc, row = parent_loc.unique(dim=0, return_inverse=True)
+            parent_loc, row = distinct_rows(parent_loc)
             parent_bricks = self.bricks_at(parent_loc, layout)
             parents = {name: bricks[row] for name, bricks in parent_bricks.items()}
         answer = wait_for(self.fill(Nodes(loc, layout, parents=parents)))

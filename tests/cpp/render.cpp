@@ -3,8 +3,9 @@
 //
 // Usage: render libgvtorch_cpu.so tracer.pt rays.pt
 
+#define AT_PER_OPERATOR_HEADERS  // torch/script.h, which has all of these, takes twice as long to compile
 #include <dlfcn.h>
-#include <torch/script.h>
+#include <torch/csrc/jit/serialization/import.h>
 
 #include <cstdio>
 
@@ -21,7 +22,7 @@ int main(int argc, char** argv) {
   torch::jit::Module rays = torch::jit::load(argv[3]);
   const auto inputs = rays.forward({}).toTuple()->elements();
   const auto hits = tracer.forward({inputs[0], inputs[1], inputs[2], inputs[3]}).toTuple()->elements();
-  const auto sum = [&](int index) { return hits[index].toTensor().to(torch::kDouble).sum().item<double>(); };
+  const auto sum = [&](int index) { return hits[index].toTensor().to(at::kDouble).sum().item<double>(); };
   std::printf("%.9f %.9f %.0f\n", sum(0), sum(1), sum(3));
   return 0;
 }

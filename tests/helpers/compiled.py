@@ -6,21 +6,51 @@ import fcntl
 import hashlib
 import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import gvtorch as gv
-from gvtorch.cpp_ext import compilers
+from gvtorch.cpp_ext import compilers, instructions
 from helpers import TESTS
 
 HEADER = TESTS / "cpp" / "user_shaders.h"
 
 
-def quick_compiler(folder: Path, *first_lines: str) -> str:
+# What users' shaders include of torch and of the standard library: half of what is read.
+PREFIX = """
+#include <algorithm>
+#include <immintrin.h>
+#include <optional>
+#include <string_view>
+#include <tuple>
+#include <torch/csrc/stable/accelerator.h>
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+"""
+
+
+def quick_compiler(folder: Path, *first_lines: str, compiler: str | None = None) -> str:
     """Writes a compiler that does not optimise, after some lines of shell; returns its path."""
-    compiler, file = shutil.which(compilers.find_cxx()[0]), folder / "c++"
+    compiler, file = compiler or shutil.which(compilers.find_cxx()[0]), folder / "c++"
     file.write_text("\n".join(("#!/bin/sh", *first_lines, f'exec {compiler} "$@" -O0\n')))
     file.chmod(0o755)
     return str(file)
+
+
+def prepared_compiler(folder: Path) -> str:
+    """Writes a quick compiler with precompiled headers and, if there is one, a quick linker."""
+    linker = "-fuse-ld=gold" if shutil.which("ld.gold") else ""
+    prefix = folder / "gv_prefix.h"
+    prefix.write_text(PREFIX)
+    # A header of the system's is not listed as one that the shader depends on.
+    add = f'set -- -isystem {folder} -include {prefix.name} "$@" -MMD {linker}'
+    compiler = quick_compiler(folder, f'case "$*" in *GV_USER_SHADER*) {add};; esac')
+    flags = (*compilers.CXX_FLAGS, *compilers.INSTRUCTION_SETS[instructions()], "-pthread")
+    include, _ = compilers.torch_flags()
+    command = [compiler, *flags, *include, "-x", "c++-header", prefix, "-o", f"{prefix}.gch"]
+    subprocess.run(command, check=True)
+    return compiler
 
 
 def users_shader(header: Path, struct: str, **options) -> gv.CompiledShader:

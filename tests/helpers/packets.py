@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,26 +24,34 @@ INSTRUCTIONS = ["baseline", "avx2", "avx512"]
 
 
 class Run(NamedTuple):
-    process: subprocess.Popen
+    process: BaseProcess
     file: Path
 
 
 def start(
     function: Callable[[], object], folder: Path, instructions: str, **environment: str
 ) -> Run:
-    """Calls a function of a test file in a new process, which saves what it returns."""
+    """Calls a function of a test file in a new process, which saves what it returns. It is forked
+    from one that has imported torch, and imports gvtorch itself.
+    """
     module, name, file = function.__module__, function.__name__, folder / f"{instructions}.pt"
+    variables = {**os.environ, "GVTORCH_CPU": instructions, **environment}
     code = (
-        f"import sys, torch; sys.path.insert(0, {str(TESTS)!r}); from {module} import {name};"
-        f"torch.save({name}(), {str(file)!r})"
+        f"import os, sys, torch; os.environ.clear(); os.environ.update({variables!r})\n"
+        f"assert 'gvtorch' not in sys.modules; sys.path.insert(0, {str(TESTS)!r})\n"
+        f"from {module} import {name}; torch.save({name}(), {str(file)!r})"
     )
-    environment = {**os.environ, "GVTORCH_CPU": instructions, **environment}
-    return Run(subprocess.Popen([sys.executable, "-c", code], env=environment), file)
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torch"])
+    process = context.Process(target=exec, args=(code, {}))
+    process.start()
+    return Run(process, file)
 
 
 def result(run: Run):
     """Returns the tensors that the function returned."""
-    assert run.process.wait(timeout=600) == 0
+    run.process.join(600)
+    assert run.process.exitcode == 0
     return torch.load(run.file, weights_only=True)
 
 
