@@ -103,6 +103,13 @@ def test_n5(tmp_path, grid, more):
     assert gv.read_volume(tmp_path / "four", axes="czyx").data.shape == (7, 9, 12, 5)
 
 
+def test_coarse_n5_lies_over_the_fine_one(tmp_path, grid):
+    factors = {"pixelResolution": [4, 5, 6], "offset": [1, 2, 3], "downsamplingFactors": [2, 1, 4]}
+    source = open_source(n5(tmp_path / "s1", grid, factors))
+    assert source.spacing == (8, 5, 24)
+    assert source.origin == (1 + 4 / 2, 2, 3 + 3 * 6 / 2)  # the centre of 2, 1 and 4 fine voxels
+
+
 def test_hostile_chunks_take_no_memory(tmp_path):
     zarr.create_array(str(tmp_path / "a"), shape=(3000,) * 3, dtype="u1", chunks=(2000,) * 3)
     with pytest.raises(ValueError, match="a chunk takes 8000000000 bytes"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,37 @@ def test_metaimage_with_colors_times_and_other_types(tmp_path, grid):
     assert source.times == 3
     actual = source.read_region((0, 0, 0), (7, 9, 12))[..., 0]
     assert np.array_equal(actual, four[2, :, ::-1, ::-1].astype("float32"))
+
+
+def write_mha(path: Path, content: bytes, **fields: str) -> Path:
+    """Writes a file of 12x9x7 int16 numbers with the fields of a header that other programs use."""
+    head = {"NDims": "3", "DimSize": "12 9 7", "ElementType": "MET_SHORT"}
+    head |= fields | {"ElementDataFile": "LOCAL"}
+    path.write_bytes("".join(f"{k} = {v}\n" for k, v in head.items()).encode() + content)
+    return path
+
+
+@pytest.mark.parametrize("true", ["True", "true", "T", "1"])
+def test_metaimage_says_true_in_several_ways(tmp_path, grid, true):
+    path, expected = tmp_path / "a.mha", grid[:, ::-1, ::-1]
+    big = {"BinaryData": true, "BinaryDataByteOrderMSB": true}
+    numbers = grid.astype(">i2").tobytes()
+    packed = zlib.compress(numbers)
+    is_packed = {"CompressedData": true, "CompressedDataSize": str(len(packed))}
+    for content, fields in (
+        (numbers, big),
+        (packed, big | is_packed),
+        (b"in between" + grid.tobytes(), {"HeaderSize": "-1"}),  # numbers are at the end
+    ):
+        volume = gv.read_volume(write_mha(path, content, **fields))
+        assert np.array_equal(volume.data[..., 0].numpy(), expected), fields
+        assert np.array_equal(itk.GetArrayFromImage(itk.ReadImage(str(path))), grid)
+
+
+def test_metaimage_keeps_when_its_times_begin(tmp_path, grid):
+    four = {"NDims": "4", "DimSize": "12 9 1 7", "Offset": "1 2 3 60", "ElementSpacing": "1 1 1 5"}
+    info = open_source(write_mha(tmp_path / "a.mha", grid.tobytes(), **four)).info
+    assert (info.time_step, info.time_origin) == (5, 60)
 
 
 def test_metaimage_without_its_numbers(tmp_path, grid):

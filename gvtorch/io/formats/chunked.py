@@ -3,7 +3,8 @@
 The meaning and coordinates of Zarr's axes come from their names (`dimension_names`, xarray's
 `_ARRAY_DIMENSIONS`) and from sibling arrays of these names, those of N5's from `pixelResolution`,
 `resolution` or `transform`. N5's first axis is the fastest one: x.
-Source: Zarr specification, versions 2 and 3; N5 specification (github.com/saalfeldlab/n5).
+Source: Zarr specification, versions 2 and 3; N5 specification (github.com/saalfeldlab/n5), and
+n5-viewer for `downsamplingFactors`.
 """
 
 from __future__ import annotations
@@ -219,7 +220,11 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
     )
     voxel_size = [abs(steps.get(a, 1.0) * factors.get(a, 1.0)) for a in "xyz"]
     spacing, unit_name = spacing_of(voxel_size, [unit if isinstance(unit, str) else None] * 3)
-    return spacing, (starts.get("x", 0.0), starts.get("y", 0.0), starts.get("z", 0.0)), unit_name
+    # A coarse voxel's centre is that of the fine ones in it: (f - 1) / 2 of them further.
+    x, y, z = (
+        starts.get(a, 0.0) + (factors.get(a, 1.0) - 1) / 2 * abs(steps.get(a, 1.0)) for a in "xyz"
+    )
+    return spacing, (x, y, z), unit_name
 
 
 def _numbers_or_default(values: Any, count: int, default: float) -> list[float]:

@@ -31,6 +31,7 @@ _MAX_SKIPPED_BYTES = 1 << 24  # of one line, or of unpacked data
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
 _SPATIAL_KINDS = ("domain", "space")
+_UNCLEAR_KINDS = ("???", "none", "list", "stub")  # of axes that may count slices
 #: Fields of the format; others are key/value pairs of the file's writer.
 _FIELDS = {
     *("type", "dimension", "sizes", "encoding", "endian", "data file", "datafile", "block size"),
@@ -144,6 +145,11 @@ def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes:
             roles = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if roles.count("s") == 3 and roles.count("t") <= 1 and roles.count("c") <= 1:
             return "".join(roles)
+        if set(kinds) - {*_SPATIAL_KINDS, *_UNCLEAR_KINDS}:
+            raise ValueError(
+                f"{path}: expected three axes of space, got kinds {', '.join(kinds)}; axes "
+                "(--axes) may name them otherwise"
+            )
     axis_order = ask_axes(path, shape[::-1], axes)[::-1]
     if sum(letter in "zyx" for letter in axis_order) != 3:
         raise ValueError(f"{path}: expected three axes of space, got {axis_order[::-1]}")
@@ -224,18 +230,13 @@ def _info(
     unit = unit_names.pop() if len(unit_names) == 1 else None
     if unit is None and any(spatial):
         dropped.append(f"units of space {', '.join(spatial)}")
-    step: float | None = None
-    step_unit = None
+    step, origin, step_unit = None, 0.0, None
     if "t" in axis_roles:
         time_axis = axis_roles.index("t")
-        steps = (
-            *_directions(header, len(axis_roles))[time_axis, 3:],
-            _steps(header, len(axis_roles))[0][time_axis],
-        )
-        step = next(
-            (float(candidate) for candidate in steps if np.isfinite(candidate) and candidate > 0),
-            None,
-        )
+        steps, first = (values[time_axis] for values in _steps(header, len(axis_roles)))
+        steps = (*_directions(header, len(axis_roles))[time_axis, 3:], steps)
+        step = next((float(n) for n in steps if np.isfinite(n) and n > 0), None)
+        origin = float(first) if np.isfinite(first) else 0.0
         step_unit = time_unit(units[time_axis]) if step else None
     space = str(header.get("space", "")).lower().removesuffix("-time")
     info = ImageInfo(
@@ -245,6 +246,7 @@ def _info(
         labels=any(str(name).startswith("Segment0_") for name in header),
         space=_SPACES.get(space, space) or None,
         time_step=step,
+        time_origin=origin,
         time_unit=step_unit,
     )
     return info, dropped
