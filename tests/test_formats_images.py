@@ -153,6 +153,30 @@ def test_mrc_axes_and_starts(tmp_path, grid):
     assert store.info.unit == "angstrom"
 
 
+def test_mrc_with_a_slanted_cell(tmp_path):
+    """A monoclinic cell: its edge c leans 20 degrees from z to -x. Values are linear in the world,
+    so resampling keeps them.
+    """
+    lean = np.radians(20)
+    columns, rows = 0.5 * np.array((1, 0, 0)), 3 * np.array((-np.sin(lean), 0, np.cos(lean)))
+    steps = np.stack((2 * np.array((0, 1, 0)), rows, columns), 1)  # of sections, rows, columns
+    index = np.stack(np.mgrid[0:7, 0:9, 0:12], -1) + (4, 0, 0)
+    world = index @ steps.T
+    with mrcfile.new(tmp_path / "a.mrc", data=(world @ (1, 2, 3)).astype("f4")) as out:
+        out.header.mx, out.header.my, out.header.mz = 12, 7, 9  # of the edges a, b, c
+        out.header.cella, out.header.cellb = (6.0, 14.0, 27.0), (90, 110, 90)
+        out.header.mapc, out.header.mapr, out.header.maps, out.header.nzstart = 1, 3, 2, 4
+    with pytest.warns(UserWarning, match="turned by 20 degrees: resampled"):
+        volume = gv.read_volume(tmp_path / "a.mrc")
+    positions = np.stack(np.mgrid[tuple(slice(n) for n in volume.extent)], -1) * volume.spacing
+    positions += volume.origin
+    stored = positions @ np.linalg.inv(steps).T - (4, 0, 0)
+    inside = ((stored >= 0) & (stored <= (6, 8, 11))).all(-1)
+    values = volume.data[..., 0].numpy().T
+    assert inside.sum() > 400
+    assert values[inside] == pytest.approx((positions @ (1, 2, 3))[inside], abs=1e-4)
+
+
 def test_broken_maps_give_one_line(tmp_path, grid):
     mrcfile.write(tmp_path / "a.mrc", grid)
     assert_robust(tmp_path / "a.mrc", tmp_path / "broken")
