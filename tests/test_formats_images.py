@@ -160,7 +160,7 @@ def test_mrc_with_a_slanted_cell(tmp_path):
     lean = np.radians(20)
     columns, rows = 0.5 * np.array((1, 0, 0)), 3 * np.array((-np.sin(lean), 0, np.cos(lean)))
     steps = np.stack((2 * np.array((0, 1, 0)), rows, columns), 1)  # of sections, rows, columns
-    index = np.stack(np.mgrid[0:7, 0:9, 0:12], -1) + (4, 0, 0)
+    index = np.stack(np.mgrid[4:11, 0:9, 0:12], -1)
     world = index @ steps.T
     with mrcfile.new(tmp_path / "a.mrc", data=(world @ (1, 2, 3)).astype("f4")) as out:
         out.header.mx, out.header.my, out.header.mz = 12, 7, 9  # of the edges a, b, c

@@ -29,6 +29,10 @@ _LERC = 34887
 _PICTURE_COMPRESSIONS = (
     *JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546,
 )  # fmt: skip
+_PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
+    0: "that high values are meant to be dark (MinIsWhite)",
+    3: "the colours of its palette: values are numbers of its entries",
+}
 _MAX_XML_CHARS = 1 << 28
 _MAX_PLANES = 1 << 16
 _MAX_LISTED_PLANES = 1 << 22  # that OME-XML may list
@@ -71,6 +75,12 @@ def tiff_messages(log: list[logging.LogRecord], *, damage: bool = False) -> list
         if record.levelno >= logging.WARNING and is_damage == damage:
             messages.append(text)
     return messages
+
+
+def photometric_dropped(series: Any) -> tuple[str, ...]:
+    """Returns what is not kept of how the numbers of a series are to be shown, a phrase or none."""
+    note = _PHOTOMETRIC_DROPPED.get(int(series.keyframe.photometric))
+    return () if note is None else (note,)
 
 
 def _check_ome_xml(path: str, description: str) -> None:
@@ -246,6 +256,8 @@ def imagej_info(
         channels.append(ChannelInfo(color=color, window=(low, high) if low < high else None))
     if any(name in metadata for name in ("Overlays", "ROI")):
         dropped.append("overlays and regions of interest")
+    if any(finite_number(metadata.get(f"{axis}origin")) for axis in "xyz"):
+        dropped.append("the position of its origin")
     displayed = [c for c in channels if c.color or c.window]
     info = ImageInfo(
         unit=unit_name,

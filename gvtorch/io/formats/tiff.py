@@ -13,12 +13,21 @@ import numpy as np
 from ...base import boxes
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, FileMetadata, Index, VolumeSource, read_planes
-from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff, tiff_messages
+from ..tiff_info import (
+    JPEG,
+    check_pictures,
+    imagej_info,
+    ome_info,
+    opened_tiff,
+    photometric_dropped,
+    tiff_messages,
+)
 from .format import Format, choose
 
-_PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
-    0: "that high values are meant to be dark (MinIsWhite)",
-    3: "the colours of its palette: values are numbers of its entries",
+#: What tifffile calls programs and standards with tags of their own, which are not read here.
+_OTHER_METADATA = {
+    *("andor", "epics", "fei", "fluoview", "geotiff", "lsm", "mdgel", "metaseries", "nih"),
+    *("scanimage", "sem", "sis", "stk", "tvips"),
 }
 
 
@@ -170,7 +179,7 @@ def _read_metadata(
     photometric = int(series.keyframe.photometric)
     is_color = width in (3, 4) and photometric in (2, 6)  # RGB, YCbCr
     channels = color_channels(width) if is_color else ()
-    dropped = [_PHOTOMETRIC_DROPPED[photometric]] if photometric in _PHOTOMETRIC_DROPPED else []
+    dropped = [*photometric_dropped(series)]
     if series.kind == "imagej":
         info, spacing, also_dropped = imagej_info(file.imagej_metadata, _resolution(file), width)
         return (
@@ -178,6 +187,8 @@ def _read_metadata(
             spacing,
             [*also_dropped, *dropped],
         )
+    if others := sorted(_OTHER_METADATA & file.pages[0].flags):
+        dropped.append(f"metadata of {', '.join(others)}, such as sizes of voxels")
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
         dropped.append("the size of a pixel in centimeters: the distance between pages is missing")
