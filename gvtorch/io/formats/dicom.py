@@ -43,7 +43,9 @@ class DicomSource(VolumeSource):
     frames: tuple[tuple[str, int, float, float], ...]
 
     def check_file(self) -> None:
-        """Raises ValueError if an uncompressed file is too short for its images."""
+        """Raises ValueError if an uncompressed file is too short for its images, or if their values
+        do not begin at the lowest bit.
+        """
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
             header, file_bytes = _header(file), os.stat(file).st_size
             meta = header.file_meta if "file_meta" in vars(header) else {}
@@ -51,10 +53,17 @@ class DicomSource(VolumeSource):
             if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
                 continue
             values = math.prod(_image_shape(header)) * (number + 1)
+            if header.get("PhotometricInterpretation") == "YBR_FULL_422":
+                values = values * 2 // 3  # two pixels share their colour
             needed_bytes = values * int(header.get("BitsAllocated") or 0) // 8
             if file_bytes < needed_bytes:
                 raise ValueError(
                     f"{file}: its images take {needed_bytes} bytes, the file has {file_bytes}"
+                )
+            high_bit, bits = (header.get(name) or 0 for name in ("HighBit", "BitsStored"))
+            if high_bit > bits - 1 >= 0:
+                raise ValueError(
+                    f"{file}: High Bit is {high_bit} of {bits} bits; expected {bits - 1}"
                 )
 
     def read_stored(self, index: Index) -> np.ndarray:
@@ -241,9 +250,9 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
 
 def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
     """Returns the smallest dtype that holds every value after rescaling."""
-    for tag, dtype in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
-        if tag in header:
-            return dtype
+    float_dtype = {32: "float32", 64: "float64"}.get(header.get("BitsAllocated"))
+    if "BitsStored" not in header and float_dtype:  # Float Pixel Data, Double Float Pixel Data
+        return float_dtype
     bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
     if not 1 <= bits <= 32:
         raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
