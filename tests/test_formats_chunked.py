@@ -65,6 +65,24 @@ def test_zarr_of_xarray(tmp_path, grid, version):
         gv.read_volume(tmp_path / "a", key="../b")
 
 
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("dtype", ["i2", "f4"])
+@pytest.mark.filterwarnings("ignore:.*onsolidated")
+def test_packed_zarr_of_xarray(tmp_path, version, dtype):
+    """Values are scaled, and missing ones are NaN, as xarray reads them."""
+    values = np.arange(60, dtype="f4").reshape(3, 4, 5) * 0.5
+    values[1, 2, 3] = np.nan
+    encoding = {"dtype": dtype, "_FillValue": -7} | (
+        {"scale_factor": 0.25, "add_offset": 3.0} if dtype == "i2" else {}
+    )
+    data = xarray.Dataset({"v": (("z", "y", "x"), values)})
+    options = {"zarr_format": version, "consolidated": False, "encoding": {"v": encoding}}
+    data.to_zarr(tmp_path / "a", **options)
+    actual = open_source(tmp_path / "a").read_region((0, 0, 0), values.shape)[..., 0]
+    assert np.array_equal(actual, values, equal_nan=True)
+    assert gv.read_volume(tmp_path / "a", nan=-1).data[1, 2, 3, 0] == -1
+
+
 def n5(folder: Path, grid: np.ndarray, more: dict | None = None) -> Path:
     spec = {"driver": "n5", "kvstore": {"driver": "file", "path": f"{folder}/"}}
     size = {"dimensions": list(grid.shape[::-1]), "blockSize": [4] * grid.ndim}

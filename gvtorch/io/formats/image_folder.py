@@ -94,7 +94,7 @@ def open_folder(path: str) -> SlicesSource:
     first = _decode_image(str(files[0]))
     if first.ndim not in (2, 3):
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
-    info, dropped = ImageInfo(), ()
+    info, dropped = ImageInfo(), tuple[str, ...]()
     if files[0].suffix.lower() in _TIFF_ENDINGS:
         with _opened_slice(str(files[0])) as (series, _):
             dropped = photometric_dropped(series)
