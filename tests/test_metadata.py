@@ -164,6 +164,18 @@ def test_nrrd_without_kinds_is_asked_about(tmp_path):
     assert np.array_equal(volume.data.numpy(), data.transpose(3, 2, 1, 0))
 
 
+def test_nrrd_axes_may_be_named_in_any_order(tmp_path):
+    nrrd = pytest.importorskip("nrrd")
+    data = np.arange(7 * 6 * 5, dtype=np.int16).reshape(7, 6, 5)  # fastest first
+    nrrd.write(str(tmp_path / "a.nrrd"), data, {"spacings": [1, 2, 3], "axis mins": [4, 5, 6]})
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd", axes="xyz")
+    assert np.array_equal(volume.data[..., 0].numpy(), data)
+    assert volume.spacing == (3, 2, 1) and volume.origin == (7.5, 6, 4.5)
+    nrrd.write(str(tmp_path / "b.nrrd"), data, {"space directions": np.eye(3), "space": "RAS"})
+    with pytest.raises(ValueError, match="axes must be z, y, x in this order: its header"):
+        gv.read_volume(tmp_path / "b.nrrd", axes="xyz")
+
+
 def test_nrrd_of_a_colour_picture_is_no_volume(tmp_path):
     nrrd = pytest.importorskip("nrrd")
     data = np.arange(3 * 6 * 5, dtype=np.uint8).reshape(3, 6, 5)

@@ -71,7 +71,7 @@ class VolumeSource(ABC):
     whole: bool = False  # every read unpacks the whole file: one read of all is better
     unpacked_bytes: int = 0  # size of the largest piece that is unpacked at once
     # Time in ns; distinguishes sources of one path in caches of open files.
-    opened: int = dataclasses.field(default_factory=time_ns)
+    opened: int = dataclasses.field(default_factory=time_ns, repr=False)
 
     @property
     def extent(self) -> tuple[int, int, int]:

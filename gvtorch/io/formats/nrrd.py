@@ -127,7 +127,7 @@ def _skip_lines(file: str, start: int, count: int) -> int:
 
 
 def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
-    """Returns the meaning of each axis: "s" space, "t" times, "c" components."""
+    """Returns the meaning of each axis: "x", "y", "z" space, "t" times, "c" components."""
     rank, kinds = len(shape), [str(kind).lower() for kind in header.get("kinds", ())]
     if rank < 3:
         raise ValueError(f"{path}: expected 3 axes of space, got {rank} axes")
@@ -144,7 +144,8 @@ def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes:
             )
             roles = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if roles.count("s") == 3 and roles.count("t") <= 1 and roles.count("c") <= 1:
-            return "".join(roles)
+            letters = iter("xyz")
+            return "".join(next(letters) if role == "s" else role for role in roles)
         if set(kinds) - {*_SPATIAL_KINDS, *_UNCLEAR_KINDS}:
             raise ValueError(
                 f"{path}: expected three axes of space, got kinds {', '.join(kinds)}; axes "
@@ -153,7 +154,10 @@ def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes:
     axis_order = ask_axes(path, shape[::-1], axes)[::-1]
     if sum(letter in "zyx" for letter in axis_order) != 3:
         raise ValueError(f"{path}: expected three axes of space, got {axis_order[::-1]}")
-    return "".join("s" if letter in "zyx" else letter for letter in axis_order)
+    in_order = "xyz" in axis_order.replace("c", "").replace("t", "")
+    if not in_order and np.isfinite(_directions(header, rank)).any():
+        raise ValueError(f"{path}: axes must be z, y, x in this order: its header directs them")
+    return axis_order
 
 
 def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
@@ -196,20 +200,20 @@ def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _affine(header: dict[str, Any], axis_roles: str) -> np.ndarray:
-    """Returns (4, 4) the affine of the three axes of space."""
-    spatial = [axis for axis, role in enumerate(axis_roles) if role == "s"]
+    """Returns (4, 4) the affine of the three axes of space, in their order."""
+    spatial = [axis for axis, role in enumerate(axis_roles) if role in "xyz"]
+    world_axis = ["xyz".index(axis_roles[axis]) for axis in spatial]
     directions = _directions(header, len(axis_roles))[spatial, :3]
     spacings, first = (values[spatial] for values in _steps(header, len(axis_roles)))
     affine = np.eye(4)
-    if not np.isnan(directions).all():
-        affine[:3, :3] = directions.T
-    elif not np.isnan(spacings).all():
-        affine[:3, :3] = np.diag(np.where(np.isnan(spacings), 1, spacings))
+    affine[:3, :3] = directions.T
+    if np.isnan(directions).all():
+        affine[:3, :3] = np.eye(3)[:, world_axis] * np.where(np.isnan(spacings), 1, spacings)
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
     if origin.shape in ((3,), (4,)) and not np.isnan(origin[:3]).all():
         affine[:3, 3] = origin[:3]
     if "space origin" not in header and np.isfinite(first).all():
-        affine[:3, 3] = first
+        affine[world_axis, 3] = first
     return affine  # `place_axes` refuses NaN and infinity
 
 
@@ -225,7 +229,7 @@ def _info(
     units = [str(unit) for unit in header.get("units", ())]
     units = units if len(units) == len(axis_roles) else [""] * len(axis_roles)
     spatial = [str(unit) for unit in header.get("space units", ())][:3]
-    spatial = spatial or [u for u, role in zip(units, axis_roles, strict=True) if role == "s"]
+    spatial = spatial or [u for u, role in zip(units, axis_roles, strict=True) if role in "xyz"]
     unit_names = {length_unit(unit) for unit in spatial}
     unit = unit_names.pop() if len(unit_names) == 1 else None
     if unit is None and any(spatial):

@@ -186,8 +186,8 @@ def _check_settings(target: Path, settings: dict[str, Any]) -> None:
     if previous.get("fingerprint") != current["fingerprint"]:
         raise ValueError(
             f"{target}: the source is not the one that it was begun with "
-            f"({previous.get('source')}): size or time of change differ; remove the store to begin "
-            "again"
+            f"({previous.get('source')}): its size, time of change or what is read of it differ; "
+            "remove the store to begin again"
         )
     for key, value in current.items():
         if key != "source" and previous.get(key) != value:
@@ -246,7 +246,7 @@ def checksum(arrays: Iterable[np.ndarray]) -> int:
     """Returns the CRC-32 of the bytes of arrays, one after the other."""
     total = 0
     for array in arrays:
-        total = zlib.crc32(array.tobytes(), total)
+        total = zlib.crc32(np.ascontiguousarray(array).data, total)
     return total
 
 
