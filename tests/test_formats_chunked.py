@@ -169,8 +169,10 @@ def test_raw_of_any_ending(tmp_path, grid, name):
     assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
     with pytest.raises(ValueError, match="takes 1512 bytes, the file has 1516"):
         gv.read_volume(file, shape=(12, 9, 7), dtype="<i2")
-    with pytest.raises(ValueError, match="offset must be bytes"):
+    with pytest.raises(ValueError, match="offset must be an int >= 0, got -1"):
         gv.read_volume(file, shape=(12, 9, 7), dtype="<i2", offset=-1)
+    with pytest.raises(ValueError, match=r"shape must be an int >= 0, got 7\.5"):
+        gv.read_volume(file, shape=(12, 9, 7.5), dtype="<i2", offset=4)
     with pytest.raises(ValueError, match=r"unknown volume format.*shape and dtype"):
         gv.read_volume(file)
 

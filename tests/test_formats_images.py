@@ -346,6 +346,14 @@ def test_scalars_come_before_other_arrays_in_both_vtk_formats(tmp_path, grid):
         assert np.array_equal(volume.data[..., 0].numpy(), grid)
 
 
+def test_words_of_legacy_vtk_have_any_case(tmp_path):
+    head = "# vtk DataFile Version 3.0\na\nascii\ndataset structured_points\ndimensions 3 3 3\n"
+    numbers = " ".join(map(str, range(27)))
+    array = f"point_data 27\nscalars a short\nlookup_table default\n{numbers}\n"
+    (tmp_path / "a.vtk").write_text(f"{head}{array}")
+    assert gv.read_volume(tmp_path / "a.vtk").data.flatten().tolist() == list(range(27))
+
+
 def test_other_vtk_files_are_named(tmp_path):
     (tmp_path / "a.vtk").write_bytes(b"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\n\n")
     with pytest.raises(ValueError, match=r"POLYDATA.*expected STRUCTURED_POINTS"):
