@@ -36,6 +36,11 @@ _DETACHED_HEADERS = (".mhd", ".nhdr")
 Version = dict[str, str]  # what identifies the version of a file on its server, as its ETag
 
 
+def local_path(text: str) -> str:
+    """Returns the path of a file:// URL; any other text as it is."""
+    return unquote(urlsplit(text).path) if text.startswith("file://") else text
+
+
 def is_file_url(text: str) -> bool:
     """Returns whether a URL is of a file, with a file's ending, and not of a Zarr or N5 folder."""
     if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
