@@ -47,10 +47,8 @@ class DicomSource(VolumeSource):
         do not begin at the lowest bit.
         """
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
-            header, file_bytes = _header(file), os.stat(file).st_size
-            meta = header.file_meta if "file_meta" in vars(header) else {}
-            syntax = meta.get("TransferSyntaxUID")
-            if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
+            header, file_bytes, syntax = _header(file), os.stat(file).st_size, _syntax(file)
+            if not syntax or syntax.is_compressed or syntax == _DEFLATED:
                 continue
             values = math.prod(_image_shape(header)) * (number + 1)
             if header.get("PhotometricInterpretation") == "YBR_FULL_422":
@@ -163,17 +161,23 @@ def _header(file: str) -> Any:
     return header
 
 
-def _check_deflated(file: str) -> None:
+def _file_meta(file: str) -> Any:
     from pydicom.filereader import read_file_meta_info
 
-    if not _has_magic(file):
-        return
-    meta = read_file_meta_info(file)
-    if str(meta.get("TransferSyntaxUID", "")) != _DEFLATED:
+    return read_file_meta_info(file) if _has_magic(file) else {}
+
+
+def _syntax(file: str) -> Any:
+    """Returns the transfer syntax of a file; "" if it does not say."""
+    return _file_meta(file).get("TransferSyntaxUID", "")
+
+
+def _check_deflated(file: str) -> None:
+    if _syntax(file) != _DEFLATED:
         return
     size, decompressor = 0, zlib.decompressobj(-zlib.MAX_WBITS)
     with open(file, "rb") as stream:
-        stream.seek(144 + int(meta.get("FileMetaInformationGroupLength", 0)))
+        stream.seek(144 + int(_file_meta(file).get("FileMetaInformationGroupLength", 0)))
         while size <= _MAX_UNPACKED_BYTES and (packed := stream.read(1 << 16)):
             while packed and size <= _MAX_UNPACKED_BYTES:
                 size += len(decompressor.decompress(packed, 1 << 20))
@@ -271,10 +275,9 @@ def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
 def _decode_images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
     """Decodes some of the images of a file."""
     import pydicom
-    from pydicom.filereader import read_file_meta_info
     from pydicom.pixels import iter_pixels
 
-    syntax = read_file_meta_info(file).get("TransferSyntaxUID", "") if _has_magic(file) else ""
+    syntax = _syntax(file)
     if syntax == _DEFLATED:  # pydicom can only unpack whole files of this kind
         return iter_pixels(pydicom.dcmread(file), indices=numbers)
     return iter_pixels(file, indices=numbers, decoding_plugin=plugin_of(str(syntax)))

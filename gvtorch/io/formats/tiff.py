@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -64,28 +63,15 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     planes, depth, length, width, samples = keyframe.shaped
     if planes != 1 or depth != 1 or len(page.dataoffsets) != math.prod(keyframe.chunked):
         return page.asarray()[index]
-    rows, columns = index[0], index[1]
-    tile_height, tile_width = (keyframe.tilelength, keyframe.tilewidth) if keyframe.is_tiled else (
-        keyframe.rowsperstrip, width,
-    )  # fmt: skip
-    tile_height, tiles_across = (
-        min(tile_height, length) if not keyframe.is_tiled else tile_height,
-        -(-width // tile_width),
-    )
-    out = np.zeros((rows.stop - rows.start, columns.stop - columns.start, samples), keyframe.dtype)
-    first, last = (rows.start, columns.start), (rows.stop, columns.stop)
-    tile_indices = itertools.product(
-        range(rows.start // tile_height, -(-rows.stop // tile_height)),
-        range(columns.start // tile_width, -(-columns.stop // tile_width)),
-    )
-    for tile_row, tile_column in tile_indices:
-        tile = _unpack_tile(page, keyframe, tile_row * tiles_across + tile_column)
-        if tile is None:
-            continue
-        corner = np.array((tile_row * tile_height, tile_column * tile_width))
-        tile = tile[: length - corner[0], : width - corner[1]]
-        low, high = np.maximum(first, corner), np.minimum(last, corner + tile.shape[:2])
-        out[boxes.index(low - first, high - first)] = tile[boxes.index(low - corner, high - corner)]
+    height, across = min(keyframe.rowsperstrip, length), width
+    if keyframe.is_tiled:
+        height, across = keyframe.tilelength, keyframe.tilewidth
+    low, high = zip(*((span.start, span.stop) for span in index[:2]), strict=True)
+    out = np.zeros((*np.subtract(high, low), samples), keyframe.dtype)
+    for row, column in boxes.tile_indices(low, high, (height, across)):
+        tile = _unpack_tile(page, keyframe, row * -(-width // across) + column)
+        if tile is not None:
+            boxes.paste(out, low, tile, (row * height, column * across))
     return out[..., index[2]] if len(index) == 3 else out[..., 0]
 
 

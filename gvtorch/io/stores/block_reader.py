@@ -4,7 +4,6 @@ what is missing or was replaced is an error. `cut_blocks` cuts blocks out of any
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -196,8 +195,7 @@ class BlockReader:
         shape = shape[len(time_index) :]
         space_axis = len(shape) == 4  # c, z, y, x
         side = shape[space_axis]
-        spans = [range(a // side, (b - 1) // side + 1) for a, b in zip(low, high, strict=True)]
-        shard_indices = [*itertools.product(*spans)]
+        shard_indices = [*boxes.tile_indices(low, high, [side] * 3)]
         for shard_index in () if is_coarse else shard_indices:
             self._checksums.check(spec, shard_index, deadline)
         for shard_index in shard_indices:
