@@ -34,14 +34,14 @@ _SPATIAL_KINDS = ("domain", "space")
 _UNCLEAR_KINDS = ("???", "none", "list", "stub")  # of axes that may count slices
 #: Fields of the format; others are key/value pairs of the file's writer.
 _FIELDS = {
-    *("type", "dimension", "sizes", "encoding", "endian", "data file", "datafile", "block size"),
-    *("byte skip", "byteskip", "line skip", "lineskip", "content", "sample units", "number"),
-    *("space", "space dimension", "space units", "space origin", "space directions", "spacings"),
-    *("kinds", "units", "labels", "centers", "centerings", "thicknesses", "axis mins", "axismins"),
-    *("axis maxs", "axismaxs", "sampleunits", "blocksize", "measurement frame", "min", "max"),
-    *("old min", "oldmin", "old max", "oldmax"),
+    *("type", "dimension", "sizes", "encoding", "endian", "data file", "block size", "byte skip"),
+    *("line skip", "content", "sample units", "number", "space", "space dimension", "space units"),
+    *("space origin", "space directions", "spacings", "kinds", "units", "labels", "centers"),
+    *("thicknesses", "axis mins", "axis maxs", "measurement frame", "min", "max", "old min"),
+    *("old max",),
 }
-_DROPPED_FIELDS = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
+_OTHER_SPELLINGS = {name.replace(" ", ""): name for name in _FIELDS} | {"centerings": "centers"}
+_DROPPED_FIELDS = ("measurement frame", "old min", "old max")
 
 
 @Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
@@ -50,8 +50,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     import nrrd
 
     with open(path, "rb") as file:
-        header = nrrd.read_header(file)
+        fields = nrrd.read_header(file)
         offset = file.tell()
+    header = {_OTHER_SPELLINGS.get(name, name): value for name, value in fields.items()}
     shape = tuple(int(n) for n in header["sizes"])
     if header.get("dimension") != len(shape):
         raise ValueError(f"{path}: {len(shape)} sizes, dimension {header.get('dimension')}")
@@ -68,7 +69,7 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         raise ValueError(f"{path}: endian {header['endian']!r} is neither little nor big")
     axis_roles = _axis_roles(path, header, shape, axes)
     info, dropped = _info(header, axis_roles, shape)
-    fields: dict[str, Any] = {
+    fields = {
         "path": path,
         "shape": shape,
         "stored": np.dtype((">" if header.get("endian") == "big" else "<") + number_dtype).str,
@@ -79,9 +80,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
             *(axis_roles.index(role) if role in axis_roles else None for role in "ct"),
         ),
     }
-    data_name = header.get("data file", header.get("datafile"))
-    skip_bytes = int(header.get("byte skip", header.get("byteskip", 0)))
-    skip_lines = int(header.get("line skip", header.get("lineskip", 0)))
+    data_name = header.get("data file")
+    skip_bytes = int(header.get("byte skip", 0))
+    skip_lines = int(header.get("line skip", 0))
     if data_name is not None and (
         not isinstance(data_name, str) or data_name.startswith("LIST") or "%" in data_name
     ):
@@ -167,12 +168,9 @@ def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
     return directions if is_valid else np.full((rank, 3), np.nan)
 
 
-def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
-    """Returns (axes,) the numbers of the first field of `names` that the header has; NaN if it has
-    none, or not a number for each axis.
-    """
-    field = next((header[name] for name in names if name in header), np.zeros(0))
-    values = np.asarray(field, dtype=np.float64)
+def _numbers(header: dict[str, Any], rank: int, name: str) -> np.ndarray:
+    """Returns (axes,) the numbers of a field; NaN if the header lacks it, or not one per axis."""
+    values = np.asarray(header.get(name, ()), dtype=np.float64)
     return values if values.shape == (rank,) else np.full(rank, np.nan)
 
 
@@ -183,14 +181,10 @@ def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
     Source: NRRD format, sections "axis mins" and "centers"; values whose centering is not given
         count as those of cells, as in Teem.
     """
-    low = _numbers(header, rank, "axis mins", "axismins")
-    high = _numbers(header, rank, "axis maxs", "axismaxs")
-    centerings = header.get("centers", header.get("centerings", ""))
-    centerings = (
-        (centerings if isinstance(centerings, str) else " ".join(map(str, centerings)))
-        .lower()
-        .split()
-    )
+    low, high = (_numbers(header, rank, name) for name in ("axis mins", "axis maxs"))
+    centers = header.get("centers", "")
+    centers = centers if isinstance(centers, str) else " ".join(map(str, centers))
+    centerings = centers.lower().split()
     centerings = centerings if len(centerings) == rank else ["cell"] * rank
     in_cells = np.array([centering != "node" for centering in centerings])
     intervals = np.asarray(header["sizes"]) - ~in_cells
@@ -246,7 +240,7 @@ def _info(
     info = ImageInfo(
         unit=unit,
         channels=_channels(header, axis_roles, shape),
-        quantity=str(header.get("sample units", header.get("sampleunits", ""))) or None,
+        quantity=str(header.get("sample units", "")) or None,
         labels=any(str(name).startswith("Segment0_") for name in header),
         space=_SPACES.get(space, space) or None,
         time_step=step,
