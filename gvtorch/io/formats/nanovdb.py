@@ -19,14 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..packed import blosc_begin, unpack_block
-from ..sparse_grid import (
-    COUNTS,
-    VOXELS,
-    SparseGrid,
-    SparseSource,
-    bits,
-    check_roots,
-)
+from ..sparse_grid import COUNTS, VOXELS, SparseGrid, SparseSource, bits, check_roots
 from .format import Format, choose
 
 _FILE_MAGICS = (b"NanoVDB0", b"NanoVDB2")

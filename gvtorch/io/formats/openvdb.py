@@ -356,12 +356,7 @@ class VdbGrid(SparseGrid):
         )
         topology = _Topology(cursor, packing).read(kind, grid.leaves_start)
         return cls(
-            dtype=dtype,
-            background=background,
-            data=data,
-            kind=kind,
-            packing=packing,
-            **topology,
+            dtype=dtype, background=background, data=data, kind=kind, packing=packing, **topology
         )
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:

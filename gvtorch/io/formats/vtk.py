@@ -286,10 +286,7 @@ def _xml_place(
 
 
 def _open_legacy(path: str, key: str | None) -> VolumeSource:
-    with (
-        open(path, "rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-    ):
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         lines = content[:4096].split(b"\n", 4)
         if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
             raise ValueError(f"{path}: is not a legacy VTK file")

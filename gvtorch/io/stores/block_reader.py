@@ -17,12 +17,7 @@ from .checksums import Checksums, shard_path
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .level_reader import LevelReader
 from .store_layout import BORDER, CELL, StoreLayout
-from .tensorstores import (
-    Deadline,
-    StoreError,
-    begin_open,
-    read_key,
-)
+from .tensorstores import Deadline, StoreError, begin_open, read_key
 
 _BATCH_BLOCKS = 256  # blocks read at once; larger batches only cost memory traffic
 _BLOCKS_AHEAD = 2 * _BATCH_BLOCKS  # blocks being read at a time
@@ -178,12 +173,7 @@ class BlockReader:
         block[..., self._channels] = values
 
     def check_shards(
-        self,
-        spec: dict[str, Any],
-        data: np.ndarray,
-        low: Zyx,
-        high: Zyx,
-        deadline: Deadline,
+        self, spec: dict[str, Any], data: np.ndarray, low: Zyx, high: Zyx, deadline: Deadline
     ) -> None:
         """Raises StoreError if a shard of `data`, items `low` to `high` of an array, is not the one
         that was written, or if zeros come from a missing shard: these arrays are written in full,

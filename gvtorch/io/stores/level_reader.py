@@ -23,13 +23,7 @@ from ..source import no_time_message
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MAX_STORE_VOXELS, StoreLayout
-from .tensorstores import (
-    Deadline,
-    StoreError,
-    begin_open,
-    child,
-    one_line_error,
-)
+from .tensorstores import Deadline, StoreError, begin_open, child, one_line_error
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE_SIDE = 64  # voxels along a side of a tile that is computed on demand

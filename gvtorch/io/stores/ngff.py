@@ -18,20 +18,8 @@ from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import metres
 from ..http import Endless
 from ..remote import is_file_url
-from .store_layout import (
-    JOURNAL,
-    MANIFEST,
-    RESUME_ADVICE,
-    WORK,
-    StoreLayout,
-    is_number,
-)
-from .tensorstores import (
-    MAX_JSON_BYTES,
-    Deadline,
-    child,
-    read_key,
-)
+from .store_layout import JOURNAL, MANIFEST, RESUME_ADVICE, WORK, StoreLayout, is_number
+from .tensorstores import MAX_JSON_BYTES, Deadline, child, read_key
 
 CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
 _MAX_LEVELS = 64

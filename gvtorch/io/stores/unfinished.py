@@ -22,13 +22,7 @@ from ...base.volume import Volume, movable
 from ...base.whole_file import durable_file, name_in_errors, rename
 from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
 from .ngff import image_metadata, read_json_file
-from .store_layout import (
-    GROUPS,
-    JOURNAL,
-    MANIFEST,
-    WORK,
-    StoreLayout,
-)
+from .store_layout import GROUPS, JOURNAL, MANIFEST, WORK, StoreLayout
 
 Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
 _LOCK = "lock"
