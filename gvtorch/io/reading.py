@@ -174,7 +174,7 @@ def _find_opener(
     if not isinstance(path, (str, PathLike)):
         text, kind = "array", "an array"
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
-        known_options: tuple[str, ...] = ("axes",)
+        known_options: tuple[str, ...] = () if isinstance(path, Volume) else ("axes",)
     else:
         text, key = split_path(local_path(str(path)))
         if is_file_url(text):

@@ -85,7 +85,7 @@ def convert(
         resume: Continue a half-written store. A finished one is returned as it is, if its grid,
             dtype, block and threshold are those requested; its voxels are not compared.
         progress: Called with ("converting", bytes done, bytes in all).
-        **options: shape, dtype, key and axes, as for `read_volume`.
+        **options: shape, dtype, offset, key and axes, as for `read_volume`.
 
     Returns:
         The store, open.

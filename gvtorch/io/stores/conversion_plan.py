@@ -94,6 +94,9 @@ def source_of(
     False; it then holds only the time points to be written.
     """
     check.known_options("convert", options, FormatSettings)
+    given = [name for name, value in options.items() if value is not None]
+    if given and isinstance(source, (VolumeSource, Volume)):
+        raise ValueError(f"convert: {', '.join(given)} is for files and arrays, not for volumes")
     if isinstance(source, VolumeSource):
         return source
     if isinstance(source, Volume):
