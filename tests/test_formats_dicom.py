@@ -273,6 +273,27 @@ def test_a_modality_s_table_is_told(tmp_path, data):
     assert np.array_equal(volume.data[0, ..., 0].numpy(), image[::-1, ::-1])
 
 
+@pytest.mark.parametrize(
+    ("fields", "value", "dtype"),
+    [
+        ({"PixelRepresentation": 1}, -5, "int16"),
+        ({"BitsStored": 16, "HighBit": 15}, 60_000, "uint16"),
+    ],
+)
+def test_images_of_a_series_may_store_numbers_differently(tmp_path, fields, value, dtype):
+    images = np.full((3, 5, 7), 9, "<i4")
+    images[2] = value
+    for z, image in enumerate(images):
+        file = dataset(Rows=5, Columns=7, InstanceNumber=z, SOPInstanceUID=f"1.2.{z}")
+        file.PixelSpacing, file.ImageOrientationPatient = [1, 1], [1, 0, 0, 0, 1, 0]
+        file.ImagePositionPatient, file.PixelData = [0, 0, z], image.astype("<u2").tobytes()
+        for name, own in fields.items() if z else ():
+            setattr(file, name, own)
+        file.save_as(tmp_path / f"{z}", enforce_file_format=True)
+    values = gv.read_volume(tmp_path).data[..., 0].numpy()
+    assert values.dtype == dtype and np.array_equal(values, images)
+
+
 def test_a_mapping_to_real_world_values_is_told(tmp_path, data):
     mapping, image = pydicom.Dataset(), np.abs(data[0]).astype("<u2")
     mapping.RealWorldValueSlope, mapping.RealWorldValueIntercept = 2.0, 1.0

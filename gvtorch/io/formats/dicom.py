@@ -239,7 +239,7 @@ def _series_source(path: str, headers: list[Any]) -> DicomSource:
     return DicomSource(
         path=path,
         shape=(len(times), depth, rows, columns, *color),
-        stored=_dtype(first, frames),
+        stored=_dtype(headers, frames),
         frames=tuple((f.file, f.number, f.slope, f.intercept) for f in frames),
         info=info,
         dropped=(*dropped, *info_dropped),
@@ -252,24 +252,29 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
     return (int(header.get("Rows") or 0), int(header.get("Columns") or 0), samples)
 
 
-def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
+def _dtype(headers: Sequence[Any], frames: Sequence[DicomFrame]) -> str:
     """Returns the smallest dtype that holds every value after rescaling."""
-    float_dtype = {32: "float32", 64: "float64"}.get(header.get("BitsAllocated"))
-    if "BitsStored" not in header and float_dtype:  # Float Pixel Data, Double Float Pixel Data
+    float_dtype = {32: "float32", 64: "float64"}.get(headers[0].get("BitsAllocated"))
+    if "BitsStored" not in headers[0] and float_dtype:  # Float or Double Float Pixel Data
         return float_dtype
-    bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
-    if not 1 <= bits <= 32:
-        raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
-    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-    extremes: list[float] = []
+    ranges, extremes = {_stored_range(header) for header in headers}, list[float]()
     for slope, intercept in {(frame.slope, frame.intercept) for frame in frames}:
         if not (slope.is_integer() and intercept.is_integer()):
             return "float32"
-        extremes += [low * slope + intercept, high * slope + intercept]
+        extremes += [end * slope + intercept for end in chain(*ranges)]
     for dtype in ("uint8", "int8", "int16", "uint16"):
         if np.iinfo(dtype).min <= min(extremes) and max(extremes) <= np.iinfo(dtype).max:
             return dtype
-    return "int32" if max(map(abs, extremes)) < 2**31 and bits > 16 else "float32"
+    is_wide = any(high - low >= 2**16 for low, high in ranges)
+    return "int32" if max(map(abs, extremes)) < 2**31 and is_wide else "float32"
+
+
+def _stored_range(header: Any) -> tuple[int, int]:
+    """Returns the smallest and the largest value that an image may store."""
+    bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
+    if not 1 <= bits <= 32:
+        raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
+    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
 
 
 def _decode_images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
