@@ -93,8 +93,8 @@ def fetch(url: str) -> Path:
         os.utime(cached[0].parent)
         return cached[0]
     stream, size, version = download
-    folder.mkdir(parents=True, exist_ok=True)
     with closing(stream):
+        folder.mkdir(parents=True, exist_ok=True)
         file = _download(url, folder, stream, size)
     version_folder = folder / (
         _version_key(version) if version else file.parent.name.strip(".").split("-")[1]
