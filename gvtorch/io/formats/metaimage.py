@@ -109,7 +109,9 @@ def _is_true(header: dict[str, str], *names: str) -> bool:
 
 
 def _numbers(path: str, header: dict[str, str], count: int, *names: str) -> np.ndarray | None:
-    """Returns the `count` numbers of the first field of `names` that the header has."""
+    """Returns the `count` numbers of the first field of `names` that the header has; None if it
+    has none of them.
+    """
     text = next((header[name] for name in names if name in header), None)
     values = np.array([float(v) for v in text.split()]) if text else None
     if values is not None and len(values) != count:
