@@ -272,6 +272,44 @@ def test_resume_refuses_a_source_that_has_changed(tmp_path, raw, monkeypatch):
         convert(raw, tmp_path / "a.zarr", resume=True)
 
 
+@pytest.mark.parametrize("kind", ["h5", "npz", "raw", "mhd", "npy"])
+def test_resume_refuses_other_parts_of_the_same_file(tmp_path, kind, data, monkeypatch):
+    """Another array, other axes or another byte order of a file; numbers beside their header."""
+    file, target, cube = (
+        tmp_path / f"a.{kind}",
+        tmp_path / "a.zarr",
+        data[:9, :9, :9, 0].astype("<i2"),
+    )
+    arrays, options = {"a": cube, "b": cube + 1}, {}
+    before, after = {"key": "a"}, {"key": "b"}
+    if kind == "h5":
+        with pytest.importorskip("h5py").File(file, "w") as content:
+            for name, array in arrays.items():
+                content[name] = array
+    elif kind == "npz":
+        np.savez(file, **arrays)
+    elif kind == "mhd":
+        before = after = {}
+        fields = "DimSize = 9 9 9\nElementType = MET_SHORT\nElementDataFile = a.bin\n"
+        file.write_text(fields)
+        (tmp_path / "a.bin").write_bytes(cube.tobytes())
+    elif kind == "npy":
+        np.save(file, cube)
+        before, after = {"axes": "zyx"}, {"axes": "xyz"}
+    else:
+        file.write_bytes(cube.tobytes())
+        before, after = {"dtype": "<i2"}, {"dtype": ">i2"}
+        options = {"shape": (9, 9, 9)}
+    with monkeypatch.context() as patch:
+        crash_after(patch, 1, Crash())
+        with pytest.raises(Crash):
+            convert(file, target, workers=1, **options, **before)
+    if kind == "mhd":
+        os.utime(tmp_path / "a.bin", ns=(1, 1))
+    with pytest.raises(ValueError, match="what is read of it differ"):
+        convert(file, target, workers=1, resume=True, **options, **after)
+
+
 def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
     target = tmp_path / "a.zarr"
 

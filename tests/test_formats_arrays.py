@@ -137,6 +137,15 @@ def test_times_and_axes_are_asked_about(grid):
     assert np.array_equal(gv.as_volume(named, time=2).data[..., 0].numpy(), grid)
 
 
+def test_options_of_arrays_are_not_for_volumes(tmp_path, grid):
+    """A volume has its axes; before, they were ignored."""
+    assert np.array_equal(gv.read_volume(gv.Volume(grid)).data[..., 0].numpy(), grid)
+    with pytest.raises(ValueError, match=r"axes is for .* files, this is an array"):
+        gv.read_volume(gv.Volume(grid), axes="xyz")
+    with pytest.raises(ValueError, match="axes is for files and arrays, not for volumes"):
+        convert(gv.Volume(grid), tmp_path / "a.zarr", axes="xyz")
+
+
 @pytest.mark.parametrize("array", [None, "words", [1, 2], object(), {"a": 1}])
 def test_what_is_no_array_is_named(array):
     with pytest.raises(ValueError, match=r"as_volume \(\w+\): expected a volume"):

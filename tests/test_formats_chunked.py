@@ -65,6 +65,24 @@ def test_zarr_of_xarray(tmp_path, grid, version):
         gv.read_volume(tmp_path / "a", key="../b")
 
 
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("dtype", ["i2", "f4"])
+@pytest.mark.filterwarnings("ignore:.*onsolidated")
+def test_packed_zarr_of_xarray(tmp_path, version, dtype):
+    """Values are scaled, and missing ones are NaN, as xarray reads them."""
+    values = np.arange(60, dtype="f4").reshape(3, 4, 5) * 0.5
+    values[1, 2, 3] = np.nan
+    encoding = {"dtype": dtype, "_FillValue": -7} | (
+        {"scale_factor": 0.25, "add_offset": 3.0} if dtype == "i2" else {}
+    )
+    data = xarray.Dataset({"v": (("z", "y", "x"), values)})
+    options = {"zarr_format": version, "consolidated": False, "encoding": {"v": encoding}}
+    data.to_zarr(tmp_path / "a", **options)
+    actual = open_source(tmp_path / "a").read_region((0, 0, 0), values.shape)[..., 0]
+    assert np.array_equal(actual, values, equal_nan=True)
+    assert gv.read_volume(tmp_path / "a", nan=-1).data[1, 2, 3, 0] == -1
+
+
 def n5(folder: Path, grid: np.ndarray, more: dict | None = None) -> Path:
     spec = {"driver": "n5", "kvstore": {"driver": "file", "path": f"{folder}/"}}
     size = {"dimensions": list(grid.shape[::-1]), "blockSize": [4] * grid.ndim}
@@ -101,6 +119,13 @@ def test_n5(tmp_path, grid, more):
     with pytest.raises(ValueError, match="what are the axes of shape"):
         gv.read_volume(tmp_path / "four")
     assert gv.read_volume(tmp_path / "four", axes="czyx").data.shape == (7, 9, 12, 5)
+
+
+def test_coarse_n5_lies_over_the_fine_one(tmp_path, grid):
+    factors = {"pixelResolution": [4, 5, 6], "offset": [1, 2, 3], "downsamplingFactors": [2, 1, 4]}
+    source = open_source(n5(tmp_path / "s1", grid, factors))
+    assert source.spacing == (8, 5, 24)
+    assert source.origin == (1 + 4 / 2, 2, 3 + 3 * 6 / 2)  # the centre of 2, 1 and 4 fine voxels
 
 
 def test_hostile_chunks_take_no_memory(tmp_path):
@@ -144,8 +169,10 @@ def test_raw_of_any_ending(tmp_path, grid, name):
     assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
     with pytest.raises(ValueError, match="takes 1512 bytes, the file has 1516"):
         gv.read_volume(file, shape=(12, 9, 7), dtype="<i2")
-    with pytest.raises(ValueError, match="offset must be bytes"):
+    with pytest.raises(ValueError, match="offset must be an int >= 0, got -1"):
         gv.read_volume(file, shape=(12, 9, 7), dtype="<i2", offset=-1)
+    with pytest.raises(ValueError, match=r"shape must be an int >= 0, got 7\.5"):
+        gv.read_volume(file, shape=(12, 9, 7.5), dtype="<i2", offset=4)
     with pytest.raises(ValueError, match=r"unknown volume format.*shape and dtype"):
         gv.read_volume(file)
 

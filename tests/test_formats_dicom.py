@@ -273,6 +273,73 @@ def test_a_modality_s_table_is_told(tmp_path, data):
     assert np.array_equal(volume.data[0, ..., 0].numpy(), image[::-1, ::-1])
 
 
+@pytest.mark.parametrize(
+    ("fields", "value", "dtype"),
+    [
+        ({"PixelRepresentation": 1}, -5, "int16"),
+        ({"BitsStored": 16, "HighBit": 15}, 60_000, "uint16"),
+    ],
+)
+def test_images_of_a_series_may_store_numbers_differently(tmp_path, fields, value, dtype):
+    images = np.full((3, 5, 7), 9, "<i4")
+    images[2] = value
+    for z, image in enumerate(images):
+        file = dataset(Rows=5, Columns=7, InstanceNumber=z, SOPInstanceUID=f"1.2.{z}")
+        file.PixelSpacing, file.ImageOrientationPatient = [1, 1], [1, 0, 0, 0, 1, 0]
+        file.ImagePositionPatient, file.PixelData = [0, 0, z], image.astype("<u2").tobytes()
+        for name, own in fields.items() if z else ():
+            setattr(file, name, own)
+        file.save_as(tmp_path / f"{z}", enforce_file_format=True)
+    values = gv.read_volume(tmp_path).data[..., 0].numpy()
+    assert values.dtype == dtype and np.array_equal(values, images)
+
+
+def test_a_mapping_to_real_world_values_is_told(tmp_path, data):
+    mapping, image = pydicom.Dataset(), np.abs(data[0]).astype("<u2")
+    mapping.RealWorldValueSlope, mapping.RealWorldValueIntercept = 2.0, 1.0
+    file = dataset(Rows=data.shape[1], Columns=data.shape[2], PixelData=image.tobytes())
+    file.RealWorldValueMappingSequence = [mapping]
+    file.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    with pytest.warns(UserWarning, match="the mapping to real world values: values are as stored"):
+        volume = gv.read_volume(tmp_path / "a.dcm")
+    assert np.array_equal(volume.data[0, ..., 0].numpy(), image[::-1, ::-1])
+
+
+@pytest.mark.parametrize(("tag", "dtype"), [("Float", "<f4"), ("DoubleFloat", "<f8")])
+def test_pixels_that_are_floats(tmp_path, data, tag, dtype):
+    image = data[0].astype(dtype) / 7
+    file = dataset(Rows=image.shape[0], Columns=image.shape[1], BitsAllocated=8 * image.itemsize)
+    for name in ("BitsStored", "HighBit", "PixelRepresentation"):
+        delattr(file, name)
+    setattr(file, f"{tag}PixelData", image.tobytes())
+    file.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    actual = gv.read_volume(tmp_path / "a.dcm").data[0, ..., 0].numpy()
+    assert np.array_equal(actual, image[::-1, ::-1].astype("f4"))
+
+
+def test_values_that_do_not_begin_at_the_lowest_bit_are_refused(tmp_path, data):
+    file = dataset(Rows=data.shape[1], Columns=data.shape[2], HighBit=15)
+    file.PixelData = (np.abs(data[0]).astype("<u2") % 4096 << 4).tobytes()
+    file.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    with pytest.raises(ValueError, match="High Bit is 15 of 12 bits; expected 11"):
+        gv.read_volume(tmp_path / "a.dcm")
+
+
+def test_pixels_that_share_their_colour(tmp_path):
+    """Two pixels take four bytes; without a distance of pixels, the header tells their shape."""
+    file = dataset(Rows=40, Columns=60, PlanarConfiguration=0, PixelAspectRatio=[3, 2])
+    file.SamplesPerPixel, file.PhotometricInterpretation = 3, "YBR_FULL_422"
+    file.BitsAllocated, file.BitsStored, file.HighBit = 8, 8, 7
+    image = np.full((40, 30, 4), 128, "u1")  # luma, luma, blue, red: grey
+    image[..., 0], image[..., 1] = noise((2, 40, 30))
+    file.PixelData = image.tobytes()
+    file.save_as(tmp_path / "a.dcm", enforce_file_format=True)
+    volume = gv.read_volume(tmp_path / "a.dcm")
+    expected = image[..., :2].reshape(40, 60)[::-1, ::-1, None]
+    assert np.abs(volume.data[0].numpy().astype(int) - expected).max() <= 1
+    assert volume.spacing == (2, 3, 1) and volume.info.unit is None
+
+
 @pytest.mark.parametrize("codec", ["jpeg", "ljpeg"])
 def test_frames_through_imagecodecs(tmp_path, codec):
     import imagecodecs

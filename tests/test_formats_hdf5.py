@@ -60,6 +60,8 @@ def test_several_sets_are_asked_about(tmp_path, grid):
     ):
         gv.read_volume(file)
     assert np.array_equal(gv.read_volume(file, key="g/b").data[..., 0].numpy(), grid + 1)
+    with pytest.raises(ValueError, match="key is given twice, also as 'a'"):
+        gv.read_volume(f"{file}:/g/b", key="a")
     with pytest.raises(ValueError, match="no data set '/c'; it holds a, g/b"):
         gv.read_volume(f"{file}:/c")
     with pytest.raises(ValueError, match="words must hold real numbers"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,37 @@ def test_metaimage_with_colors_times_and_other_types(tmp_path, grid):
     assert np.array_equal(actual, four[2, :, ::-1, ::-1].astype("float32"))
 
 
+def write_mha(path: Path, content: bytes, **fields: str) -> Path:
+    """Writes a file of 12x9x7 int16 numbers with the fields of a header that other programs use."""
+    head = {"NDims": "3", "DimSize": "12 9 7", "ElementType": "MET_SHORT"}
+    head |= fields | {"ElementDataFile": "LOCAL"}
+    path.write_bytes("".join(f"{k} = {v}\n" for k, v in head.items()).encode() + content)
+    return path
+
+
+@pytest.mark.parametrize("true", ["True", "true", "T", "1"])
+def test_metaimage_says_true_in_several_ways(tmp_path, grid, true):
+    path, expected = tmp_path / "a.mha", grid[:, ::-1, ::-1]
+    big = {"BinaryData": true, "BinaryDataByteOrderMSB": true}
+    numbers = grid.astype(">i2").tobytes()
+    packed = zlib.compress(numbers)
+    is_packed = {"CompressedData": true, "CompressedDataSize": str(len(packed))}
+    for content, fields in (
+        (numbers, big),
+        (packed, big | is_packed),
+        (b"in between" + grid.tobytes(), {"HeaderSize": "-1"}),  # numbers are at the end
+    ):
+        volume = gv.read_volume(write_mha(path, content, **fields))
+        assert np.array_equal(volume.data[..., 0].numpy(), expected), fields
+        assert np.array_equal(itk.GetArrayFromImage(itk.ReadImage(str(path))), grid)
+
+
+def test_metaimage_keeps_when_its_times_begin(tmp_path, grid):
+    four = {"NDims": "4", "DimSize": "12 9 1 7", "Offset": "1 2 3 60", "ElementSpacing": "1 1 1 5"}
+    info = open_source(write_mha(tmp_path / "a.mha", grid.tobytes(), **four)).info
+    assert (info.time_step, info.time_origin) == (5, 60)
+
+
 def test_metaimage_without_its_numbers(tmp_path, grid):
     itk.WriteImage(image(grid), str(tmp_path / "a.mhd"))
     (tmp_path / "a.raw").unlink()
@@ -119,6 +151,30 @@ def test_mrc_axes_and_starts(tmp_path, grid):
     assert volume.origin[2] == 5 * volume.spacing[2] and volume.origin[0] == -7 * volume.spacing[0]
     store = convert(tmp_path / "a.mrc", tmp_path / "a.zarr")
     assert store.info.unit == "angstrom"
+
+
+def test_mrc_with_a_slanted_cell(tmp_path):
+    """A monoclinic cell: its edge c leans 20 degrees from z to -x. Values are linear in the world,
+    so resampling keeps them.
+    """
+    lean = np.radians(20)
+    columns, rows = 0.5 * np.array((1, 0, 0)), 3 * np.array((-np.sin(lean), 0, np.cos(lean)))
+    steps = np.stack((2 * np.array((0, 1, 0)), rows, columns), 1)  # of sections, rows, columns
+    index = np.stack(np.mgrid[4:11, 0:9, 0:12], -1)
+    world = index @ steps.T
+    with mrcfile.new(tmp_path / "a.mrc", data=(world @ (1, 2, 3)).astype("f4")) as out:
+        out.header.mx, out.header.my, out.header.mz = 12, 7, 9  # of the edges a, b, c
+        out.header.cella, out.header.cellb = (6.0, 14.0, 27.0), (90, 110, 90)
+        out.header.mapc, out.header.mapr, out.header.maps, out.header.nzstart = 1, 3, 2, 4
+    with pytest.warns(UserWarning, match="turned by 20 degrees: resampled"):
+        volume = gv.read_volume(tmp_path / "a.mrc")
+    positions = np.stack(np.mgrid[tuple(slice(n) for n in volume.extent)], -1) * volume.spacing
+    positions += volume.origin
+    stored = positions @ np.linalg.inv(steps).T - (4, 0, 0)
+    inside = ((stored >= 0) & (stored <= (6, 8, 11))).all(-1)
+    values = volume.data[..., 0].numpy().T
+    assert inside.sum() > 400
+    assert values[inside] == pytest.approx((positions @ (1, 2, 3))[inside], abs=1e-4)
 
 
 def test_broken_maps_give_one_line(tmp_path, grid):
@@ -288,6 +344,14 @@ def test_scalars_come_before_other_arrays_in_both_vtk_formats(tmp_path, grid):
         with pytest.warns(UserWarning, match="other arrays"):
             volume = gv.read_volume(file)
         assert np.array_equal(volume.data[..., 0].numpy(), grid)
+
+
+def test_words_of_legacy_vtk_have_any_case(tmp_path):
+    head = "# vtk DataFile Version 3.0\na\nascii\ndataset structured_points\ndimensions 3 3 3\n"
+    numbers = " ".join(map(str, range(27)))
+    array = f"point_data 27\nscalars a short\nlookup_table default\n{numbers}\n"
+    (tmp_path / "a.vtk").write_text(f"{head}{array}")
+    assert gv.read_volume(tmp_path / "a.vtk").data.flatten().tolist() == list(range(27))
 
 
 def test_other_vtk_files_are_named(tmp_path):

@@ -210,6 +210,20 @@ def test_what_is_the_url_of_a_file(url, is_file):
     assert remote.is_file_url(url) == is_file
 
 
+def test_a_file_url_is_a_path(tmp_path):
+    data = noise((3, 4, 5), "int16")
+    np.save(tmp_path / "a b.npy", data)
+    url = (tmp_path / "a b.npy").as_uri()
+    assert url.startswith("file:///") and "%20" in url
+    assert np.array_equal(gv.read_volume(url).data[..., 0].numpy(), data)
+    store = convert(url, tmp_path / "a.zarr")
+    assert np.array_equal(
+        Store.open(f"file://{store.location}").read_region(0, (0, 0, 0), data.shape)[..., 0], data
+    )
+    with pytest.raises(FileNotFoundError, match=r"volume not found: file:///none\.npy"):
+        gv.read_volume("file:///none.npy")
+
+
 class Endless(http.server.BaseHTTPRequestHandler):
     """Answers without an end, as fast as it can or a byte at a time."""
 

@@ -228,6 +228,39 @@ def test_folders_that_are_no_stack(tmp_path):
         gv.read_volume(folder)
 
 
+def write_slices(folder: Path, images: np.ndarray, **options) -> Path:
+    folder.mkdir()
+    for number, image in enumerate(images):
+        tifffile.imwrite(folder / f"{number}.tif", image, **options)
+    return folder
+
+
+def test_tiff_slices_have_rows_columns_and_colours(tmp_path):
+    """Colours may come first; pages are no colours."""
+    data = noise((5, 20, 30, 3))
+    options = {"photometric": "rgb", "planarconfig": "separate"}
+    planes = write_slices(tmp_path / "planes", data.transpose(0, 3, 1, 2), **options)
+    assert np.array_equal(gv.read_volume(planes).data.numpy(), data)
+    pages = write_slices(tmp_path / "pages", data, photometric="minisblack")
+    with pytest.raises(ValueError, match=r"0\.tif: expected one slice, got QYX \(20, 30, 3\)"):
+        gv.read_volume(pages)
+    dark = write_slices(tmp_path / "dark", data[..., 0], photometric="miniswhite")
+    with pytest.warns(UserWarning, match="not kept: that high values are meant to be dark"):
+        assert np.array_equal(gv.read_volume(dark).data.numpy(), data[..., :1])
+
+
+def test_metadata_of_other_programs_is_told(tmp_path):
+    data = noise((5, 20, 30), "uint16")
+    keys = [(34735, "H", 4, (1, 1, 0, 0), True)]
+    for options, note in (
+        ({"extratags": keys}, "metadata of geotiff"),
+        ({"imagej": True, "metadata": {"axes": "ZYX", "xorigin": 5}}, "the position of its origin"),
+    ):
+        tifffile.imwrite(tmp_path / "a.tif", data, photometric="minisblack", **options)
+        with pytest.warns(UserWarning, match=f"not kept: {note}"):
+            assert np.array_equal(gv.read_volume(tmp_path / "a.tif").data[..., 0].numpy(), data)
+
+
 def test_a_png_bomb_is_refused_by_its_header(tmp_path):
     def part(kind: bytes, content: bytes) -> bytes:
         check = zlib.crc32(kind + content)

@@ -183,9 +183,26 @@ def test_tiff_stack_and_folder(tmp_path):
 
 
 def test_fits_is_big_endian_float():
-    volume = gv.read_volume(shared("volumes/l1448_13co_105x105x53_float32.fits.gz"))
+    with pytest.warns(UserWarning, match="not kept: world coordinates"):
+        volume = gv.read_volume(shared("volumes/l1448_13co_105x105x53_float32.fits.gz"))
     assert volume.extent == (105, 105, 53) and volume.data.dtype == torch.float32
     assert volume.value_range == pytest.approx((-0.66, 4.0), abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["a.fits", "a.fits.gz"])
+def test_fits_of_several_images(tmp_path, name):
+    fits = pytest.importorskip("astropy.io.fits")
+    first, second = fits.PrimaryHDU(grid()), fits.ImageHDU(grid() * 2, name="SIGMA")
+    first.header["BUNIT"], second.header["BZERO"] = "K", 1
+    table = fits.BinTableHDU.from_columns([fits.Column("x", "E", array=[1.0])])
+    fits.HDUList([first, fits.ImageHDU(grid()[0]), table, second]).writeto(tmp_path / name)
+    with pytest.warns(UserWarning, match="1 other images; key .* 0 'PRIMARY', 1 'SIGMA'"):
+        volume = gv.read_volume(tmp_path / name)
+    assert_is_grid(volume)
+    assert volume.info.quantity == "K"
+    for key in ("SIGMA", "1"):
+        values = gv.read_volume(tmp_path / name, key=key).data[..., 0].numpy()
+        assert np.array_equal(values, grid() * 2 + 1)
 
 
 def test_fits_with_nan(tmp_path):

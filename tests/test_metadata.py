@@ -135,12 +135,15 @@ def test_kinds_units_and_space_of_nrrd(tmp_path):
         "kinds": ["domain", "domain", "domain", "time"],
         "spacings": [0.5, 0.6, 0.7, 20],
         "units": ["mm", "mm", "mm", "ms"],
+        "axis mins": [0, 0, 0, 100],
+        "centerings": ["node"] * 4,
     }
     nrrd.write(str(tmp_path / "t.nrrd"), data, header)
     volume, warned = read_with_warnings(tmp_path / "t.nrrd", time=3)
     assert np.array_equal(volume.data[..., 0].numpy(), data[..., 3].T) and not warned
     assert volume.spacing == (0.5, 0.6, 0.7) and volume.info.unit == "millimeter"
     assert (volume.info.time_step, volume.info.time_unit) == (20, "millisecond")
+    assert volume.info.time_origin == 100
     nrrd.write(
         str(tmp_path / "u.nrrd"), data[0], {"space dimension": 3, "space units": ["furlong"] * 3}
     )
@@ -159,6 +162,30 @@ def test_nrrd_without_kinds_is_asked_about(tmp_path):
     assert np.array_equal(volume.data[..., 0].numpy(), data[..., 2].T)
     volume, _ = read_with_warnings(tmp_path / "a.nrrd", axes="zyxc")
     assert np.array_equal(volume.data.numpy(), data.transpose(3, 2, 1, 0))
+
+
+def test_nrrd_axes_may_be_named_in_any_order(tmp_path):
+    nrrd = pytest.importorskip("nrrd")
+    data = np.arange(7 * 6 * 5, dtype=np.int16).reshape(7, 6, 5)  # fastest first
+    nrrd.write(str(tmp_path / "a.nrrd"), data, {"spacings": [1, 2, 3], "axis mins": [4, 5, 6]})
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd", axes="xyz")
+    assert np.array_equal(volume.data[..., 0].numpy(), data)
+    assert volume.spacing == (3, 2, 1) and volume.origin == (7.5, 6, 4.5)
+    nrrd.write(str(tmp_path / "b.nrrd"), data, {"space directions": np.eye(3), "space": "RAS"})
+    with pytest.raises(ValueError, match="axes must be z, y, x in this order: its header"):
+        gv.read_volume(tmp_path / "b.nrrd", axes="xyz")
+
+
+def test_nrrd_of_a_colour_picture_is_no_volume(tmp_path):
+    nrrd = pytest.importorskip("nrrd")
+    data = np.arange(3 * 6 * 5, dtype=np.uint8).reshape(3, 6, 5)
+    nrrd.write(str(tmp_path / "a.nrrd"), data, {"kinds": ["RGB-color", "domain", "domain"]})
+    with pytest.raises(ValueError, match="three axes of space, got kinds rgb-color, domain"):
+        gv.read_volume(tmp_path / "a.nrrd")
+    volume, _ = read_with_warnings(tmp_path / "a.nrrd", axes="zyx")
+    assert np.array_equal(volume.data[..., 0].numpy(), data.T)
+    nrrd.write(str(tmp_path / "b.nrrd"), data, {"kinds": ["domain", "domain", "list"]})
+    assert read_with_warnings(tmp_path / "b.nrrd")[0].extent == (3, 6, 5)
 
 
 def test_nrrd_colours_have_names(tmp_path):

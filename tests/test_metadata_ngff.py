@@ -307,6 +307,12 @@ def test_axes_and_units_of_other_kinds(tmp_path):
     assert volume.spacing == (4, 3, 2000) and volume.info.unit == "nanometer"
     assert "an axis that is none of t, c, z, y, x: the first of 3 is read" in line
     assert "a transformation of type 'rotation'" in line
+    for letter, unit in (("z", "mm"), ("y", "um"), ("x", "\u00b5m")):
+        image["axes"]["azyx".index(letter)]["unit"] = unit
+    file.write_text(json.dumps(content))
+    volume, _ = read_with_warnings(folder)
+    assert volume.spacing == (4, 3, 2000) and volume.info.unit == "micrometer"
+    image["axes"][2]["unit"] = image["axes"][3]["unit"] = "nanometer"
     image["axes"][0] = {"name": "lambda", "type": "channel"}
     image["axes"][1]["unit"] = "parsec"
     file.write_text(json.dumps(content))

@@ -158,6 +158,30 @@ def test_a_strange_ply_is_named(tmp_path, head, message):
     assert str(path) in str(caught.value) and message in str(caught.value)
 
 
+@pytest.mark.parametrize("red", ["255", "300", "-1", "1.5"])
+def test_text_beyond_an_integer_of_ply_is_refused(tmp_path, red):
+    fields = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+    fields = "".join(f"property float {axis}\n" for axis in "xyz") + fields
+    head = f"ply\nformat ascii 1.0\nelement vertex 1\n{fields}end_header\n"
+    (tmp_path / "a.ply").write_text(f"{head}1 2 3 {red} 0 0\n")
+    if red == "255":
+        assert gv.read_points(tmp_path / "a.ply").colors[0].tolist() == [1, 0, 0]
+        return
+    with pytest.raises(ValueError, match=r"red holds numbers that uint8 does not"):
+        gv.read_points(tmp_path / "a.ply")
+
+
+def test_missing_values_of_fits_are_no_numbers(tmp_path):
+    fits = pytest.importorskip("astropy.io.fits")
+    columns = [fits.Column(name, "D", array=np.arange(4.0)) for name in "xyz"]
+    columns.append(fits.Column("flux", "J", null=-99, array=np.array([5, -99, 7, 8])))
+    columns.append(fits.Column("mass", "J", null=-99, array=np.array([5, 6, 7, 8])))
+    fits.BinTableHDU.from_columns(columns).writeto(tmp_path / "a.fits")
+    with pytest.raises(ValueError, match="values must be finite, got NaN"):
+        gv.read_points(tmp_path / "a.fits", values="flux")
+    assert gv.read_points(tmp_path / "a.fits", values="mass").values[1] == 6
+
+
 def test_columns_of_another_length_are_told(tmp_path):
     positions = np.random.default_rng(0).random((9, 3))
     np.savez(tmp_path / "a.npz", positions=positions, values=np.ones(9), radius=np.ones(8))

@@ -31,6 +31,7 @@ def noise(shape: tuple[int, ...] = (20, 30, 40)) -> np.ndarray:
 
 
 @pytest.mark.backend("cpp")
+@pytest.mark.filterwarnings("ignore:.*not kept. world coordinates")
 @pytest.mark.parametrize("name", FILES)
 def test_every_shared_volume_shows_at_once(name):
     """More than 5 % (other presets than gray: 3 %) and less than 90 % of all pixels show something,

@@ -4,7 +4,8 @@ the number of voxels of a box in the world.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,21 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
     missing = "".join(axis for axis in order if axis not in axes)
     all_axes = missing + axes
     return data[(None,) * len(missing)].transpose([all_axes.index(axis) for axis in order])
+
+
+def tile_indices(low: Zyx, high: Zyx, sides: Zyx) -> Iterator[tuple[int, ...]]:
+    """Yields the index of each tile of `sides` voxels that overlaps a box."""
+    return itertools.product(
+        *(range(a // n, -(-b // n)) for a, b, n in zip(low, high, sides, strict=True))
+    )
+
+
+def paste(out: np.ndarray, low: Zyx, tile: np.ndarray, corner: Zyx) -> None:
+    """Copies the part of a tile that begins at `corner` into `out`, a box that begins at `low`."""
+    begin, size = np.maximum(low, corner), len(low)
+    end = np.minimum(np.add(low, out.shape[:size]), np.add(corner, tile.shape[:size]))
+    end = np.maximum(begin, end)
+    out[index(begin - low, end - low)] = tile[index(begin - corner, end - corner)]
 
 
 def group_rows(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:

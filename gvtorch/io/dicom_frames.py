@@ -84,8 +84,9 @@ def _frame(header: Any, groups: list[Any], number: int) -> DicomFrame:
         return header.get(name)
 
     spacing = _floats(attribute("PixelMeasuresSequence", "PixelSpacing"))
-    if not spacing:
-        spacing = _floats(header.get("ImagerPixelSpacing")) or [1.0, 1.0]
+    for name in ("ImagerPixelSpacing", "PixelAspectRatio"):
+        spacing = spacing or _floats(header.get(name))
+    spacing = spacing or [1.0, 1.0]
     position = _floats(attribute("PlanePositionSequence", "ImagePositionPatient"))
     orientation = _floats(attribute("PlaneOrientationSequence", "ImageOrientationPatient"))
     slope = attribute("PixelValueTransformationSequence", "RescaleSlope")
@@ -282,6 +283,8 @@ def image_info(
     uses_table = header.get("ModalityLUTSequence") and header.get("RescaleSlope") is None
     if uses_table:
         dropped.append("the modality's table: values are those that it looks up")
+    if header.get("RealWorldValueMappingSequence") and header.get("RescaleSlope") is None:
+        dropped.append("the mapping to real world values: values are as stored")
     quantity = str(
         header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
     )

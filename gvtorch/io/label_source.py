@@ -71,11 +71,7 @@ _load_labels = functools.lru_cache(maxsize=2)(np.load)
 
 
 def indexed_source(
-    source: VolumeSource,
-    time: int | None,
-    workers: int | None,
-    folder: Path,
-    progress: Progress,
+    source: VolumeSource, time: int | None, workers: int | None, folder: Path, progress: Progress
 ) -> VolumeSource:
     """Returns a source of values as a store holds them: indices of labels; or the source itself if
     its values are no labels, are indexed already, or have at most 16 bits.

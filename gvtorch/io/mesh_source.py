@@ -26,7 +26,7 @@ from ..meshes.holes import SolidParts, warn_of_holes
 from ..meshes.mesh import Material, Mesh
 from ..meshes.voxelizer import CHANNELS, GridSettings, Voxelizer, check_channels
 from .mesh_file import read_mesh
-from .source import VolumeSource
+from .source import Index, VolumeSource
 from .stores.channels import convert_channels
 from .stores.conversion import convert
 from .stores.store import Store
@@ -108,14 +108,11 @@ class MeshSource(VolumeSource):
         settings = {**dict(self.settings), "solid": self.solid}
         return [*self.identity, self.channel, *settings.values()]
 
-    def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
+    def read_stored(self, index: Index) -> np.ndarray:
         low, high = [span.start for span in index[:3]], [span.stop for span in index[:3]]
-        return self.read_region(low, high)[..., index[3]]
-
-    def read_region(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         with _LOCK:  # the first thread builds the hierarchy
             grid = _voxelizer(self)
-        return grid.region(low, high)[self.channel].cpu().numpy()
+        return grid.region(low, high)[self.channel].cpu().numpy()[..., index[3]]
 
 
 @functools.lru_cache(maxsize=2)

@@ -125,9 +125,7 @@ class StraightSource(VolumeSource):
 
 
 def straighten(
-    source: VolumeSource,
-    oblique: Oblique | None = None,
-    first_voxel: Sequence[float] | None = None,
+    source: VolumeSource, oblique: Oblique | None = None, first_voxel: Sequence[float] | None = None
 ) -> VolumeSource:
     """Returns a source whose axes are parallel to the world's, and warns about what it did.
 

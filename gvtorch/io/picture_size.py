@@ -33,39 +33,37 @@ def picture_size(packed: bytes) -> tuple[int, int] | None:
     return None if size is None else size[:2]
 
 
+def _jpeg_segments(packed: bytes) -> Iterator[tuple[int, int]]:
+    """Yields marker and offset of each segment of a JPEG image, up to the first scan or to what is
+    no segment, whose marker is then 0.
+    """
+    position = 2
+    while packed[:2] == b"\xff\xd8" and position + 1 < len(packed) and packed[position] == 0xFF:
+        marker, length = packed[position + 1], int.from_bytes(packed[position + 2 : position + 4])
+        if marker != 0xFF:  # a fill byte
+            yield marker, position
+        if marker == _JPEG_SCAN:
+            return
+        position += 1 if marker == 0xFF else 2 if marker in _BARE_MARKERS else 2 + length
+    yield 0, position
+
+
 def jpeg_size(packed: bytes) -> tuple[int, int, int] | None:
     """Returns (columns, rows, samples) from the header of a JPEG or JPEG-LS image; None if it has
     no frame header, or several.
     """
-    position, size = 2, None
-    while packed[:2] == b"\xff\xd8" and position + 9 < len(packed) and packed[position] == 0xFF:
-        marker = packed[position + 1]
-        if marker == _JPEG_SCAN:
-            break
-        if marker in _JPEG_FRAMES:
-            if size is not None:
-                return None
-            rows, columns, samples = struct.unpack_from(">HHB", packed, position + 5)
-            size = (columns, rows, samples)
-        has_no_length = marker in _BARE_MARKERS or marker == 0xFF
-        position += (
-            (1 if marker == 0xFF else 2)
-            if has_no_length
-            else 2 + int.from_bytes(packed[position + 2 : position + 4])
-        )
-    return size
+    frames = [position for marker, position in _jpeg_segments(packed) if marker in _JPEG_FRAMES]
+    if len(frames) != 1 or frames[0] + 10 > len(packed):
+        return None
+    rows, columns, samples = struct.unpack_from(">HHB", packed, frames[0] + 5)
+    return (columns, rows, samples)
 
 
 def has_jpeg_end(packed: bytes) -> bool:
     """Returns whether a JPEG has an end marker after the start of its first scan; if not, libraries
     make the missing part grey. The two bytes of that marker can't occur in a scan's data.
     """
-    position = 2
-    while packed[position : position + 1] == b"\xff" and packed[
-        position + 1 : position + 2
-    ] != bytes([_JPEG_SCAN]):
-        is_fill_byte = packed[position + 1 : position + 2] == b"\xff"
-        position += 1 if is_fill_byte else 2 + int.from_bytes(packed[position + 2 : position + 4])
+    *_, (_, position) = _jpeg_segments(packed)
     return packed.find(b"\xff\xd9", position) >= 0
 
 

@@ -171,12 +171,17 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
             limit = min(size * MAX_UNPACK_RATIO, memory_free()) if packed else size - start
             if table.size > limit:
                 raise ValueError(f"its rows take {table.size} bytes, at most {limit} can be there")
-            column_formats = zip(table.columns.names, table.columns.formats, strict=True)
             return {
-                name: np.asarray(table.data[name])
-                for name, column_format in column_formats
-                if column_format.lstrip("0123456789")[:1] in _FITS_TYPES
+                column.name: _with_gaps(np.asarray(table.data[column.name]), column.null)
+                for column in table.columns
+                if column.format.lstrip("0123456789")[:1] in _FITS_TYPES
             }
+
+
+def _with_gaps(values: np.ndarray, null: Any) -> np.ndarray:
+    """Returns the values of a column, NaN where they are `null`, which means missing, if given."""
+    is_gap = values == null if isinstance(null, int) else np.zeros(1, bool)
+    return np.where(is_gap, np.nan, values) if is_gap.any() else values
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:
@@ -210,10 +215,21 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
                 table = np.loadtxt(rows_text, np.float64, ndmin=2, usecols=range(len(fields)))
                 if len(table) != count:
                     raise ValueError(f"{count} vertices are declared, {len(table)} are there")
-                return {n: table[:, i].astype(k[1:]) for i, (n, k) in enumerate(fields)}
+                return {n: _text_column(n, table[:, i], k[1:]) for i, (n, k) in enumerate(fields)}
             rows = np.memmap(path, dtype, "r", start + skipped_bytes, (count,))
             return {column: rows[column] for column, _ in fields}
     raise ValueError("it has no vertices")
+
+
+def _text_column(name: str, values: np.ndarray, kind: str) -> np.ndarray:
+    """Returns the float64 values of a column in its dtype; raises ValueError if an integer is not
+    whole, or out of range.
+    """
+    with np.errstate(all="ignore"):
+        column: np.ndarray = values.astype(kind)
+    if column.dtype.kind in "iu" and (column != values).any():
+        raise ValueError(f"{name} holds numbers that {column.dtype.name} does not")
+    return column
 
 
 def _ply_header(

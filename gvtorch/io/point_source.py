@@ -22,7 +22,7 @@ from ..points.points import Points
 from ..points.sorted import PointSource, SortedPoints, sort_points
 from ..points.splat import region
 from .point_file import ColumnNames, PointFile
-from .source import VolumeSource
+from .source import Index, VolumeSource
 from .stores.conversion import convert
 from .stores.store import Store
 from .stores.store_layout import WORK
@@ -62,7 +62,7 @@ class SplatSource(VolumeSource):
         """Returns values that identify the points and the settings."""
         return list(self.identity)
 
-    def read_stored(self, index: tuple[slice, ...]) -> np.ndarray:
+    def read_stored(self, index: Index) -> np.ndarray:
         low, high = (
             tuple(end) for end in zip(*((s.start, s.stop) for s in index[:3]), strict=True)
         )

@@ -22,7 +22,7 @@ from ..base.volume import Volume, check_extent
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
-from .remote import fetch, is_file_url
+from .remote import fetch, is_file_url, local_path
 from .resources import check_memory
 from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
 from .stores.ngff import is_zarr
@@ -174,12 +174,14 @@ def _find_opener(
     if not isinstance(path, (str, PathLike)):
         text, kind = "array", "an array"
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)
-        known_options: tuple[str, ...] = ("axes",)
+        known_options: tuple[str, ...] = () if isinstance(path, Volume) else ("axes",)
     else:
-        text, key = split_path(str(path))
+        text, key = split_path(local_path(str(path)))
         if is_file_url(text):
             text = str(fetch(text))
         if key is not None:
+            if "key" in arguments:
+                raise ValueError(f"{path}: key is given twice, also as {arguments['key']!r}")
             arguments["key"] = key.strip("/") if is_zarr(text) else key
         if not is_zarr(text) and not Path(text).exists():
             raise FileNotFoundError(f"volume not found: {path}")

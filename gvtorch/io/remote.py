@@ -36,6 +36,11 @@ _DETACHED_HEADERS = (".mhd", ".nhdr")
 Version = dict[str, str]  # what identifies the version of a file on its server, as its ETag
 
 
+def local_path(text: str) -> str:
+    """Returns the path of a file:// URL; any other text as it is."""
+    return unquote(urlsplit(text).path) if text.startswith("file://") else text
+
+
 def is_file_url(text: str) -> bool:
     """Returns whether a URL is of a file, with a file's ending, and not of a Zarr or N5 folder."""
     if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
@@ -88,8 +93,8 @@ def fetch(url: str) -> Path:
         os.utime(cached[0].parent)
         return cached[0]
     stream, size, version = download
-    folder.mkdir(parents=True, exist_ok=True)
     with closing(stream):
+        folder.mkdir(parents=True, exist_ok=True)
         file = _download(url, folder, stream, size)
     version_folder = folder / (
         _version_key(version) if version else file.parent.name.strip(".").split("-")[1]

@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 
 from ..base import boxes
-from ..base.image_info import ImageInfo
+from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.labels import check_narrowed
 from ..base.messages import one_line
 from ..base.whole_file import name_in_errors, save_npy
@@ -71,7 +71,7 @@ class VolumeSource(ABC):
     whole: bool = False  # every read unpacks the whole file: one read of all is better
     unpacked_bytes: int = 0  # size of the largest piece that is unpacked at once
     # Time in ns; distinguishes sources of one path in caches of open files.
-    opened: int = dataclasses.field(default_factory=time_ns)
+    opened: int = dataclasses.field(default_factory=time_ns, repr=False)
 
     @property
     def extent(self) -> tuple[int, int, int]:
@@ -257,6 +257,25 @@ class MemorySource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]
+
+
+def microscope_info(
+    unit: str | None,
+    channels: Sequence[ChannelInfo],
+    width: int,
+    step: float | None = None,
+    step_unit: str | None = None,
+) -> ImageInfo:
+    """Returns an image's info: its channels, if there is one for each of the `width` numbers of a
+    voxel; the time step and its unit, if the step is positive.
+    """
+    has_step = step is not None and 0 < step < math.inf
+    return ImageInfo(
+        unit=unit,
+        channels=tuple(channels) if len(channels) == width else (),
+        time_step=step if has_step else None,
+        time_unit=step_unit if has_step else None,
+    )
 
 
 def read_planes(

@@ -74,8 +74,8 @@ class SparseGrid(ABC):
         """
 
     @abstractmethod
-    def leaves(self, numbers: np.ndarray) -> np.ndarray:
-        """Returns (k, 512, c) the voxels of leaves (k,)."""
+    def leaf(self, offset: int) -> np.ndarray:
+        """Returns (512, c) the voxels of the leaf at an offset in `data`."""
 
     def fill(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
         """Returns (i, j, k, c) values of a box."""
@@ -97,7 +97,10 @@ class SparseGrid(ABC):
         for first in range(0, len(hits), _BATCH_LEAVES):
             numbers = hits[first : first + _BATCH_LEAVES]
             i, j, k = ((self.origins[2][numbers] - start) // leaf).T
-            blocks[i, :, j, :, k] = self.leaves(numbers).reshape(-1, 8, 8, 8, out.shape[3])
+            leaves = np.empty((len(numbers), VOXELS, out.shape[3]), self.dtype)
+            for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
+                leaves[row] = self.leaf(offset)
+            blocks[i, :, j, :, k] = leaves.reshape(-1, 8, 8, 8, out.shape[3])
         return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
 
     def _pieces(

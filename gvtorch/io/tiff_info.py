@@ -22,13 +22,17 @@ from ..base.messages import collected_log
 from ..base.units import NO_DEPTH, spacing_of, time_unit
 from .budget import check_beside
 from .picture_size import picture_size
-from .source import FileMetadata
+from .source import FileMetadata, microscope_info
 
 JPEG = (6, 7, 34892, 33007)
 _LERC = 34887
 _PICTURE_COMPRESSIONS = (
     *JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546,
 )  # fmt: skip
+_PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
+    0: "that high values are meant to be dark (MinIsWhite)",
+    3: "the colours of its palette: values are numbers of its entries",
+}
 _MAX_XML_CHARS = 1 << 28
 _MAX_PLANES = 1 << 16
 _MAX_LISTED_PLANES = 1 << 22  # that OME-XML may list
@@ -71,6 +75,12 @@ def tiff_messages(log: list[logging.LogRecord], *, damage: bool = False) -> list
         if record.levelno >= logging.WARNING and is_damage == damage:
             messages.append(text)
     return messages
+
+
+def photometric_dropped(series: Any) -> tuple[str, ...]:
+    """Returns what is not kept of how the numbers of a series are to be shown, a phrase or none."""
+    note = _PHOTOMETRIC_DROPPED.get(int(series.keyframe.photometric))
+    return () if note is None else (note,)
 
 
 def _check_ome_xml(path: str, description: str) -> None:
@@ -184,13 +194,7 @@ def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:
         channels = [*color_channels()]
     if any(_tag(child) == "ROI" for child in root):
         dropped.append("regions of interest (ROI)")
-    info = ImageInfo(
-        unit=unit,
-        channels=tuple(channels) if len(channels) == width else (),
-        time_step=step if step else None,
-        time_unit=time_unit(step_unit) if step else None,
-    )
-    return info, spacing, dropped
+    return microscope_info(unit, channels, width, step, time_unit(step_unit)), spacing, dropped
 
 
 def _ome_channel(element: Any) -> ChannelInfo:
@@ -232,7 +236,7 @@ def imagej_info(
     dropped = []
     if unit and unit_name is None and unit.lower() not in ("pixel", "pixels", "inch"):
         dropped.append(f"the unit {unit!r}, which is unknown")
-    step = finite_number(metadata.get("finterval")) or None
+    step = finite_number(metadata.get("finterval"))
     ranges = [float(v) for v in metadata.get("Ranges", ())]
     if not ranges and {"min", "max"} <= set(metadata):
         ranges = [float(metadata["min"]), float(metadata["max"])] * width
@@ -246,12 +250,11 @@ def imagej_info(
         channels.append(ChannelInfo(color=color, window=(low, high) if low < high else None))
     if any(name in metadata for name in ("Overlays", "ROI")):
         dropped.append("overlays and regions of interest")
-    displayed = [c for c in channels if c.color or c.window]
-    info = ImageInfo(
-        unit=unit_name,
-        channels=tuple(channels) if displayed else (),
-        time_step=step,
-        time_unit=time_unit(metadata.get("tunit", "sec")) if step else None,
+    if any(finite_number(metadata.get(f"{axis}origin")) for axis in "xyz"):
+        dropped.append("the position of its origin")
+    displayed = channels if any(c.color or c.window for c in channels) else []
+    info = microscope_info(
+        unit_name, displayed, width, step, time_unit(str(metadata.get("tunit", "sec")))
     )
     return info, spacing, dropped
 

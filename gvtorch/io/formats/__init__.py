@@ -1,7 +1,4 @@
-"""The file formats, one module for each; all modules in this folder are imported and registered.
-
-torch is not imported here, so that the command line can list the formats quickly.
-"""
+"""The file formats, one module for each; all modules in this folder are imported and registered."""
 
 import importlib
 import pkgutil

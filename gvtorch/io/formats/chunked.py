@@ -3,13 +3,16 @@
 The meaning and coordinates of Zarr's axes come from their names (`dimension_names`, xarray's
 `_ARRAY_DIMENSIONS`) and from sibling arrays of these names, those of N5's from `pixelResolution`,
 `resolution` or `transform`. N5's first axis is the fastest one: x.
-Source: Zarr specification, versions 2 and 3; N5 specification (github.com/saalfeldlab/n5).
+Source: Zarr specification, versions 2 and 3; N5 specification (github.com/saalfeldlab/n5), and
+n5-viewer for `downsamplingFactors`.
 """
 
 from __future__ import annotations
 
+import base64
 import functools
 import os
+import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +22,8 @@ import numpy as np
 from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
-from ..source import Index, Triple, VolumeSource
+from ..cf_source import CfSource, cf_fields
+from ..source import Index, Triple
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import is_number
@@ -33,7 +37,7 @@ _METADATA_FILES = (("zarr3", "zarr.json"), ("zarr", ".zarray"), ("n5", "attribut
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChunkedSource(VolumeSource):
+class ChunkedSource(CfSource):
     """A Zarr or N5 array."""
 
     driver: str
@@ -41,7 +45,8 @@ class ChunkedSource(VolumeSource):
 
     def read_stored(self, index: Index) -> np.ndarray:
         array, files = _open_array(self.driver, self.folder, self.opened)
-        return Deadline(_READ_TIMEOUT).wait(begin_read(array[index], files), self.folder)
+        values = Deadline(_READ_TIMEOUT).wait(begin_read(array[index], files), self.folder)
+        return self.unpack(values)
 
 
 @functools.lru_cache(maxsize=8)
@@ -144,7 +149,25 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
     placement, info_fields = axes_placement(axis_order, shape, steps, units)
     quantity = attributes.get("units")
     info = ImageInfo(quantity=quantity if isinstance(quantity, str) else None, **info_fields)
+    placement |= cf_fields(np.dtype(source.stored), _with_fill_value(driver, metadata, attributes))
     return replace(source, axes=axis_order, info=info, dropped=tuple(dropped), **placement)
+
+
+def _with_fill_value(
+    driver: str, metadata: dict[str, Any], attributes: dict[str, Any]
+) -> dict[str, Any]:
+    """Returns the attributes of an array with `_FillValue` as a number. xarray stores it as the
+    array's `fill_value` (version 2), or as bytes of a float64 in base64 (floats, version 3).
+    """
+    value = attributes.get("_FillValue")
+    if value is None and driver == "zarr" and "_ARRAY_DIMENSIONS" in attributes:
+        value = metadata.get("fill_value") or None  # 0 is that of arrays without missing values
+    if isinstance(value, str):
+        try:
+            (value,) = struct.unpack("<d", base64.b64decode(value))
+        except (ValueError, struct.error):
+            value = None
+    return attributes if value is None else attributes | {"_FillValue": value}
 
 
 def _is_n5(path: str) -> bool:
@@ -187,12 +210,13 @@ def _choose_array(path: str, key: str | None) -> str:
 
 def _open_source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tuple[int, ...]]:
     """Returns the source of an array, without axes and position, and its shape."""
-    source = ChunkedSource(path=path, shape=(), axes="", stored="u1", driver=driver, folder=folder)
+    fields: dict[str, Any] = {"path": path, "axes": "", "driver": driver, "folder": folder}
+    source = ChunkedSource(shape=(), stored="u1", packed="u1", **fields)
     array, _ = _open_array(driver, folder, source.opened)
     dtype, shape = array.dtype.numpy_dtype, tuple(int(n) for n in array.shape)
     if dtype.kind not in "biuf":
         raise ValueError(f"{path}: values must be real numbers, got dtype {array.dtype.name}")
-    return replace(source, shape=shape, stored=dtype.str), shape
+    return replace(source, shape=shape, stored=dtype.str, packed=dtype.str), shape
 
 
 def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Triple, str | None]:
@@ -219,7 +243,11 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
     )
     voxel_size = [abs(steps.get(a, 1.0) * factors.get(a, 1.0)) for a in "xyz"]
     spacing, unit_name = spacing_of(voxel_size, [unit if isinstance(unit, str) else None] * 3)
-    return spacing, (starts.get("x", 0.0), starts.get("y", 0.0), starts.get("z", 0.0)), unit_name
+    # A coarse voxel's centre is that of the fine ones in it: (f - 1) / 2 of them further.
+    x, y, z = (
+        starts.get(a, 0.0) + (factors.get(a, 1.0) - 1) / 2 * abs(steps.get(a, 1.0)) for a in "xyz"
+    )
+    return spacing, (x, y, z), unit_name
 
 
 def _numbers_or_default(values: Any, count: int, default: float) -> list[float]:

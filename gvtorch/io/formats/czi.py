@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...base.digits import finite_number
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels, from_hex
+from ...base.image_info import ChannelInfo, Rgb, color_channels, from_hex
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import FileMetadata, Index, VolumeSource, read_planes
+from ..source import FileMetadata, Index, VolumeSource, microscope_info, read_planes
 from .format import Format, choose
 
 _DTYPES = {
@@ -128,13 +128,7 @@ def _read_metadata(xml: str, width: int, colors: int, stored: str) -> FileMetada
     dropped = []
     if unit and sizes.get("Z") is None and int(root.findtext(".//Image/SizeZ") or 1) > 1:
         dropped.append(NO_DEPTH)
-    info = ImageInfo(
-        unit=unit,
-        channels=tuple(channels) if len(channels) == width * colors else (),
-        time_step=time_step if time_step and time_step > 0 else None,
-        time_unit="second" if time_step and time_step > 0 else None,
-    )
-    return info, spacing, dropped
+    return microscope_info(unit, channels, width * colors, time_step, "second"), spacing, dropped
 
 
 def _channel(element: Any, display: Any, stored: str) -> ChannelInfo:

@@ -43,18 +43,25 @@ class DicomSource(VolumeSource):
     frames: tuple[tuple[str, int, float, float], ...]
 
     def check_file(self) -> None:
-        """Raises ValueError if an uncompressed file is too short for its images."""
+        """Raises ValueError if an uncompressed file is too short for its images, or if their values
+        do not begin at the lowest bit.
+        """
         for file, number, *_ in dict((frame[0], frame) for frame in self.frames).values():
-            header, file_bytes = _header(file), os.stat(file).st_size
-            meta = header.file_meta if "file_meta" in vars(header) else {}
-            syntax = meta.get("TransferSyntaxUID")
-            if syntax is None or syntax.is_compressed or syntax == _DEFLATED:
+            header, file_bytes, syntax = _header(file), os.stat(file).st_size, _syntax(file)
+            if not syntax or syntax.is_compressed or syntax == _DEFLATED:
                 continue
             values = math.prod(_image_shape(header)) * (number + 1)
+            if header.get("PhotometricInterpretation") == "YBR_FULL_422":
+                values = values * 2 // 3  # two pixels share their colour
             needed_bytes = values * int(header.get("BitsAllocated") or 0) // 8
             if file_bytes < needed_bytes:
                 raise ValueError(
                     f"{file}: its images take {needed_bytes} bytes, the file has {file_bytes}"
+                )
+            high_bit, bits = (header.get(name) or 0 for name in ("HighBit", "BitsStored"))
+            if high_bit > bits - 1 >= 0:
+                raise ValueError(
+                    f"{file}: High Bit is {high_bit} of {bits} bits; expected {bits - 1}"
                 )
 
     def read_stored(self, index: Index) -> np.ndarray:
@@ -154,17 +161,23 @@ def _header(file: str) -> Any:
     return header
 
 
-def _check_deflated(file: str) -> None:
+def _file_meta(file: str) -> Any:
     from pydicom.filereader import read_file_meta_info
 
-    if not _has_magic(file):
-        return
-    meta = read_file_meta_info(file)
-    if str(meta.get("TransferSyntaxUID", "")) != _DEFLATED:
+    return read_file_meta_info(file) if _has_magic(file) else {}
+
+
+def _syntax(file: str) -> Any:
+    """Returns the transfer syntax of a file; "" if it does not say."""
+    return _file_meta(file).get("TransferSyntaxUID", "")
+
+
+def _check_deflated(file: str) -> None:
+    if _syntax(file) != _DEFLATED:
         return
     size, decompressor = 0, zlib.decompressobj(-zlib.MAX_WBITS)
     with open(file, "rb") as stream:
-        stream.seek(144 + int(meta.get("FileMetaInformationGroupLength", 0)))
+        stream.seek(144 + int(_file_meta(file).get("FileMetaInformationGroupLength", 0)))
         while size <= _MAX_UNPACKED_BYTES and (packed := stream.read(1 << 16)):
             while packed and size <= _MAX_UNPACKED_BYTES:
                 size += len(decompressor.decompress(packed, 1 << 20))
@@ -226,7 +239,7 @@ def _series_source(path: str, headers: list[Any]) -> DicomSource:
     return DicomSource(
         path=path,
         shape=(len(times), depth, rows, columns, *color),
-        stored=_dtype(first, frames),
+        stored=_dtype(headers, frames),
         frames=tuple((f.file, f.number, f.slope, f.intercept) for f in frames),
         info=info,
         dropped=(*dropped, *info_dropped),
@@ -239,33 +252,37 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
     return (int(header.get("Rows") or 0), int(header.get("Columns") or 0), samples)
 
 
-def _dtype(header: Any, frames: Sequence[DicomFrame]) -> str:
+def _dtype(headers: Sequence[Any], frames: Sequence[DicomFrame]) -> str:
     """Returns the smallest dtype that holds every value after rescaling."""
-    for tag, dtype in (("FloatPixelData", "float32"), ("DoubleFloatPixelData", "float64")):
-        if tag in header:
-            return dtype
-    bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
-    if not 1 <= bits <= 32:
-        raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
-    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-    extremes: list[float] = []
+    float_dtype = {32: "float32", 64: "float64"}.get(headers[0].get("BitsAllocated"))
+    if "BitsStored" not in headers[0] and float_dtype:  # Float or Double Float Pixel Data
+        return float_dtype
+    ranges, extremes = {_stored_range(header) for header in headers}, list[float]()
     for slope, intercept in {(frame.slope, frame.intercept) for frame in frames}:
         if not (slope.is_integer() and intercept.is_integer()):
             return "float32"
-        extremes += [low * slope + intercept, high * slope + intercept]
+        extremes += [end * slope + intercept for end in chain(*ranges)]
     for dtype in ("uint8", "int8", "int16", "uint16"):
         if np.iinfo(dtype).min <= min(extremes) and max(extremes) <= np.iinfo(dtype).max:
             return dtype
-    return "int32" if max(map(abs, extremes)) < 2**31 and bits > 16 else "float32"
+    is_wide = any(high - low >= 2**16 for low, high in ranges)
+    return "int32" if max(map(abs, extremes)) < 2**31 and is_wide else "float32"
+
+
+def _stored_range(header: Any) -> tuple[int, int]:
+    """Returns the smallest and the largest value that an image may store."""
+    bits, signed = int(header.get("BitsStored") or 0), int(header.get("PixelRepresentation") or 0)
+    if not 1 <= bits <= 32:
+        raise ValueError(f"{header.filename}: {bits} bits stored; expected 1 to 32")
+    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
 
 
 def _decode_images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
     """Decodes some of the images of a file."""
     import pydicom
-    from pydicom.filereader import read_file_meta_info
     from pydicom.pixels import iter_pixels
 
-    syntax = read_file_meta_info(file).get("TransferSyntaxUID", "") if _has_magic(file) else ""
+    syntax = _syntax(file)
     if syntax == _DEFLATED:  # pydicom can only unpack whole files of this kind
         return iter_pixels(pydicom.dcmread(file), indices=numbers)
     return iter_pixels(file, indices=numbers, decoding_plugin=plugin_of(str(syntax)))

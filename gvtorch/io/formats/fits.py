@@ -1,4 +1,4 @@
-"""FITS, read with astropy: the first image of three dimensions.
+"""FITS, read with astropy: an image of three dimensions.
 
 Spacing is 1, since FITS axes have units of their own (degrees, m/s).
 """
@@ -12,20 +12,23 @@ from typing import Any
 
 import numpy as np
 
+from ...base.image_info import ImageInfo
 from ..packed import is_packed_fits
 from ..source import ArraySource, Index, VolumeSource, read_planes
-from .format import Format
+from .format import Format, choose
 
 
 @dataclass(frozen=True, kw_only=True)
 class FitsSource(VolumeSource):
     """An image that is scaled or packed; it is read plane by plane, or all at once."""
 
+    number: int  # of its header-data unit
+
     def read_stored(self, index: Index) -> np.ndarray:
         from astropy.io import fits
 
         with fits.open(self.path, memmap=False) as hdus:
-            cube = _first_cube(self.path, hdus)
+            cube = hdus[self.number]
             if self.whole or self.covers(index):
                 return np.asarray(cube.data)[index]
 
@@ -35,33 +38,35 @@ class FitsSource(VolumeSource):
             return read_planes(index, len(index) - 2, self.stored, read)
 
 
-@Format("FITS", ".fits", ".fits.gz", ".fit", library="astropy")
-def open_fits(path: str) -> VolumeSource:
-    """Opens a cube; its first voxel is read to find the dtype after scaling."""
+@Format("FITS", ".fits", ".fits.gz", ".fit", options=("key",), library="astropy")
+def open_fits(path: str, key: str | None = None) -> VolumeSource:
+    """Opens the image `key` (its number or name) of those of three dimensions, the first one if
+    left out; its first voxel is read to find the dtype after scaling.
+    """
     from astropy.io import fits
 
     packed = is_packed_fits(path)
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*truncated.*")
         with fits.open(path, memmap=False) as hdus:
-            cube = _first_cube(path, hdus)
+            cubes = {n: hdu for n, hdu in enumerate(hdus) if hdu.is_image and len(hdu.shape) >= 3}
+            if not cubes:
+                raise ValueError(f"{path}: holds no image of three dimensions")
+            chosen, dropped = choose(path, "image", [hdu.name for hdu in cubes.values()], key)
+            number, cube = list(cubes.items())[chosen]
             shape = tuple(int(n) for n in cube.shape)
-            scaled = any(key in cube.header for key in ("BSCALE", "BZERO", "BLANK"))
+            if math.prod(shape[:-3]) != 1:
+                raise ValueError(f"{path}: expected a cube, got {shape}")
+            scaled = any(name in cube.header for name in ("BSCALE", "BZERO", "BLANK"))
+            if any(name.startswith(("CTYPE", "CRVAL", "CDELT")) for name in cube.header):
+                dropped = (*dropped, "world coordinates: voxels are 1 wide")
+            quantity = str(cube.header.get("BUNIT", "")).strip() or None
             dtype = np.asarray(cube.section[(slice(0, 1),) * len(shape)]).dtype
             offset = int(cube.fileinfo()["datLoc"])
             is_plain = not (scaled or packed or isinstance(cube, fits.CompImageHDU))
     fields: dict[str, Any] = {"path": path, "shape": shape, "axes": "-" * (len(shape) - 3) + "zyx"}
+    fields |= {"info": ImageInfo(quantity=quantity), "dropped": dropped}
     if is_plain:
         stored = dtype.newbyteorder(">").str
         return ArraySource(file=path, stored=stored, offset=offset, **fields)
-    return FitsSource(stored=dtype.str, whole=packed, **fields)
-
-
-def _first_cube(path: str, hdus: Any) -> Any:
-    """Returns the first image of three dimensions among the header-data units of a file."""
-    cube = next((hdu for hdu in hdus if hdu.is_image and len(hdu.shape) >= 3), None)
-    if cube is None:
-        raise ValueError(f"{path}: holds no image of three dimensions")
-    if math.prod(cube.shape[:-3]) != 1:
-        raise ValueError(f"{path}: expected a cube, got {cube.shape}")
-    return cube
+    return FitsSource(stored=dtype.str, whole=packed, number=number, **fields)

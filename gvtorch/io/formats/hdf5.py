@@ -2,7 +2,7 @@
 
 The meaning and steps of axes come from dimension scales and CF attributes (NetCDF), `axistags`
 (ilastik) and `element_size_um` (ImageJ, ilastik); else `axes` is needed, as for arrays.
-Source: HDF5 dimension scales; CF conventions 1.11, 4 (axes) and 8.1 (packed data).
+Source: HDF5 dimension scales; CF conventions 1.11, 4 (axes).
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import math
 import os
 import re
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from ...base.image_info import ChannelInfo, ImageInfo
-from ...base.labels import check_narrowed
 from ...base.named_axes import ask_axes, axes_placement, even_steps, letter_of, named_axes
 from ...base.units import spacing_of
 from ..budget import check_beside
-from ..source import Index, VolumeSource
+from ..cf_source import CfSource, cf_fields, text_of
+from ..source import Index
 from .format import Format, not_chosen
 
 _ENDINGS = (".h5", ".hdf5", ".hdf", ".he5", ".h5ad", ".ilp", ".nc", ".nc4", ".cdf")
@@ -33,42 +33,16 @@ _MAX_COORDINATES = 1 << 24  # of an axis; more are not read
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hdf5Source(VolumeSource):
+class Hdf5Source(CfSource):
     """A data set."""
 
     name: str
-    packed: str  # dtype of the values in the file, according to its attributes
-    scale: tuple[float, float] | None = None  # factor and offset of packed values
-    missing: tuple[float, ...] = ()  # packed values that mean missing
-    valid: tuple[float, float] = (-math.inf, math.inf)  # packed values outside are missing
-
-    def as_labels(self) -> Self:
-        """See `VolumeSource`; unless values are scaled, those that mean missing become labels."""
-        source = super().as_labels()
-        if self.scale:
-            return source
-        return replace(source, missing=(), valid=(-math.inf, math.inf), stored=self.packed)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Reads a part; packed values are unpacked, missing ones become NaN."""
         import h5py
 
         with h5py.File(self.path, "r") as file:
-            data = np.asarray(file[self.name][index])
-        if data.dtype.kind in "iu":
-            data = data.view(self.packed)
-        low, high = self.valid
-        if self.scale is None and not self.missing and (low, high) == (-math.inf, math.inf):
-            return data
-        values = data * np.float64(self.scale[0]) + self.scale[1] if self.scale else data
-        is_missing = (data < low) | (data > high)
-        for value in self.missing:
-            is_missing |= data == value
-        if not self.scale:
-            check_narrowed(self.path, data[~is_missing])
-        values = np.asarray(values).astype(self.stored)
-        values[is_missing] = np.nan
-        return values
+            return self.unpack(np.asarray(file[self.name][index]))
 
 
 @Format("HDF5", *_ENDINGS, options=("key", "axes"), library="h5py")
@@ -88,7 +62,10 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         _check_dataset(path, name, dataset)
         shape = tuple(int(n) for n in dataset.shape)
         axis_order, steps, units, dropped = _axes(path, dataset, shape, axes)
-        info, value_fields = _info(dataset, axis_order, shape), _value_fields(dataset)
+        info, value_fields = (
+            _info(dataset, axis_order, shape),
+            cf_fields(dataset.dtype, dataset.attrs),
+        )
         placement, info_fields = axes_placement(axis_order, shape, steps, units)
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
         if info_fields["unit"] is None and len(element_size) == 3:
@@ -236,11 +213,12 @@ def _axes(
         attributes = dict(scale.attrs) if scale is not None else {}
         names[axis] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
         kind = (
-            _text(attributes.get("axis")).lower() or _text(attributes.get("standard_name")).lower()
+            text_of(attributes.get("axis")).lower()
+            or text_of(attributes.get("standard_name")).lower()
         )
         names[axis] = kind if letter_of(kind) != "?" else names[axis]
-        units[axis] = _text(attributes.get("units")) or None
-        if _text(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
+        units[axis] = text_of(attributes.get("units")) or None
+        if text_of(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
             continue
         if scale is not None:
             _check_sources(path, scale)
@@ -270,7 +248,7 @@ def _axes(
 def _tags(dataset: Any) -> list[Any]:
     """Returns ilastik's `axistags`, one for each axis."""
     try:
-        axistags = json.loads(_text(dataset.attrs.get("axistags")) or "{}")
+        axistags = json.loads(text_of(dataset.attrs.get("axistags")) or "{}")
     except ValueError:
         return []
     tags = axistags.get("axes") if isinstance(axistags, dict) else None
@@ -279,63 +257,10 @@ def _tags(dataset: Any) -> list[Any]:
 
 def _info(dataset: Any, axis_order: str, shape: tuple[int, ...]) -> ImageInfo:
     """Returns quantity and channel names from the attributes."""
-    quantity, name = (_text(dataset.attrs.get(key)) for key in ("units", "long_name"))
+    quantity, name = (text_of(dataset.attrs.get(key)) for key in ("units", "long_name"))
     width = shape[axis_order.index("c")] if "c" in axis_order else 1
     names = np.ravel(dataset.attrs.get("channel_names", ())).tolist()
-    channels = tuple(ChannelInfo(name=_text(n)) for n in names) if len(names) == width else ()
+    channels = tuple(ChannelInfo(name=text_of(n)) for n in names) if len(names) == width else ()
     if not channels and width == 1 and name:
         channels = (ChannelInfo(name=name),)
     return ImageInfo(quantity=quantity or None, channels=channels)
-
-
-def _value_fields(dataset: Any) -> dict[str, Any]:
-    """Returns the fields `packed`, `scale`, `missing`, `valid` and `stored` of a source, from the
-    attributes.
-
-    Source: CF Conventions 1.11, sections 2.5.1 and 8.1; `_Unsigned` is of the NetCDF Users' Guide,
-        appendix A.
-    """
-    packed, unsigned = dataset.dtype, _text(dataset.attrs.get("_Unsigned")).lower()
-    is_integer, sign_stated = dataset.dtype.kind in "iu", unsigned in ("true", "false")
-    if is_integer and sign_stated:
-        packed = np.dtype(packed.str.replace(packed.kind, "u" if unsigned == "true" else "i"))
-
-    def numbers(name: str) -> list[float]:
-        values = np.ravel(dataset.attrs.get(name, ()))
-        if is_integer and sign_stated and values.dtype.kind in "iu":
-            values = values.astype(packed)
-        return values.tolist() if values.dtype.kind in "iuf" else []
-
-    def number(name: str, default: float) -> float:
-        values = numbers(name)
-        return values[0] if len(values) == 1 else default
-
-    factor, offset = number("scale_factor", math.nan), number("add_offset", math.nan)
-    scale = None
-    if not math.isnan(factor) or not math.isnan(offset):
-        scale = (1.0 if math.isnan(factor) else factor, 0.0 if math.isnan(offset) else offset)
-    missing_values = {number("_FillValue", math.nan), *numbers("missing_value")}
-    missing = tuple(sorted(v for v in missing_values if not math.isnan(v)))
-    valid = numbers("valid_range")
-    if len(valid) != 2:
-        valid = [number("valid_min", -math.inf), number("valid_max", math.inf)]
-    if is_integer and valid[0] <= np.iinfo(packed).min:  # no value lies beyond
-        valid[0] = -math.inf
-    if is_integer and valid[1] >= np.iinfo(packed).max:
-        valid[1] = math.inf
-    stored = packed.str
-    if scale or missing or valid != [-math.inf, math.inf]:
-        stored = "float64" if packed.kind == "f" and packed.itemsize > 4 else "float32"
-    return {
-        "packed": packed.str,
-        "scale": scale,
-        "missing": missing,
-        "valid": tuple(valid),
-        "stored": stored,
-    }
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        value = value.ravel()[0] if value.size == 1 else ""
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value or "")

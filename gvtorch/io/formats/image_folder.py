@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 import re
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from ..picture_size import has_jpeg_end, picture_size
 from ..resources import check_memory
 from ..source import Index, VolumeSource, convert_errors
 from ..stores.ngff import is_zarr
-from ..tiff_info import check_pictures, opened_tiff
+from ..tiff_info import check_pictures, opened_tiff, photometric_dropped
 from .format import Format
 
 _TIFF_ENDINGS = (".tif", ".tiff")
@@ -92,7 +94,10 @@ def open_folder(path: str) -> SlicesSource:
     first = _decode_image(str(files[0]))
     if first.ndim not in (2, 3):
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
-    info = ImageInfo()
+    info, dropped = ImageInfo(), tuple[str, ...]()
+    if files[0].suffix.lower() in _TIFF_ENDINGS:
+        with _opened_slice(str(files[0])) as (series, _):
+            dropped = photometric_dropped(series)
     if first.ndim == 3 and first.shape[2] in (3, 4):
         info = ImageInfo(channels=color_channels(first.shape[2]))
     return SlicesSource(
@@ -102,16 +107,31 @@ def open_folder(path: str) -> SlicesSource:
         stored=first.dtype.str,
         files=tuple(str(file) for file in files),
         info=info,
+        dropped=dropped,
     )
+
+
+@contextmanager
+def _opened_slice(file: str) -> Iterator[tuple[Any, list[int]]]:
+    """Opens a TIFF image: yields its series, and which axes of it are y, x and, if any, colours.
+    Raises ValueError if it has others.
+    """
+    with opened_tiff(file) as (tiff, _):
+        series = tiff.series[0]
+        axes = series.axes.replace("C", "S")
+        if sorted(axes) not in (["X", "Y"], ["S", "X", "Y"]):
+            raise ValueError(f"{file}: expected one slice, got {series.axes} {series.shape}")
+        yield series, [axes.index(letter) for letter in "YXS" if letter in axes]
 
 
 def _decode_image(file: str) -> np.ndarray:
     """Decodes an image."""
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
-        with opened_tiff(file) as (tiff, _):
-            check_pictures(tiff.series[0].pages)
-            return tiff.asarray()
+        with _opened_slice(file) as (series, axes):
+            check_pictures(series.pages)
+            pixels: np.ndarray = series.asarray().transpose(axes)
+            return pixels
     import imagecodecs
 
     packed = Path(file).read_bytes()
@@ -125,8 +145,8 @@ def _decode_image(file: str) -> np.ndarray:
 def _header_shape(file: str) -> tuple[Any, ...]:
     """Returns the shape from the header of an image: rows and columns first."""
     if Path(file).suffix.lower() in _TIFF_ENDINGS:
-        with opened_tiff(file) as (tiff, _):
-            return tuple(tiff.series[0].shape)
+        with _opened_slice(file) as (series, axes):
+            return tuple(series.shape[axis] for axis in axes)
     with open(file, "rb") as stream:
         header = stream.read(_HEADER_BYTES)
     if header[:2] == b"BM" and len(header) >= 26:

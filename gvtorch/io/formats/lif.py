@@ -15,9 +15,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...base.image_info import COLORS, ChannelInfo, ImageInfo
+from ...base.image_info import COLORS, ChannelInfo
 from ...base.units import NO_DEPTH, spacing_of
-from ..source import Index, VolumeSource
+from ..source import Index, VolumeSource, microscope_info
 from .format import Format, choose
 
 _MAX_HEADER_CHARS = 1 << 28
@@ -80,19 +80,14 @@ def _image_source(
         spacing, unit = (x, y, z), "micrometer"
     if unit and "z" in steps and steps["z"] is None:
         dropped.append(NO_DEPTH)
-    time_step = steps.get("t")
+    infos = [_channel(channel) for channel in channels]
     return LifSource(
         path=path,
         shape=tuple(axis.size for axis in axes),
         axes="".join(axis.letter for axis in axes),
         stored=stored,
         spacing=spacing,
-        info=ImageInfo(
-            unit=unit,
-            channels=tuple(_channel(channel) for channel in channels),
-            time_step=time_step,
-            time_unit="second" if time_step else None,
-        ),
+        info=microscope_info(unit, infos, len(infos), steps.get("t"), "second"),
         dropped=tuple(dropped),
         offset=offset,
         length=image_bytes,

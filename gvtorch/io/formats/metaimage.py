@@ -23,6 +23,7 @@ from .format import Format
 
 _LONG_TYPES = {"MET_LONG": "i4", "MET_ULONG": "u4"}
 _MAX_HEADER_BYTES = 1 << 20
+_STEP_FIELDS, _OFFSET_FIELDS = ("ElementSpacing", "ElementSize"), ("Offset", "Position", "Origin")
 _KNOWN_FIELDS = {
     *("ObjectType", "NDims", "BinaryData", "BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
     *("CompressedData", "CompressedDataSize", "TransformMatrix", "Rotation", "Orientation"),
@@ -48,13 +49,13 @@ def open_metaimage(path: str) -> VolumeSource:
     width = int(header.get("ElementNumberOfChannels", 1))
     if width < 1:
         raise ValueError(f"{path}: {width} channels")
-    is_big = header.get("ElementByteOrderMSB", header.get("BinaryDataByteOrderMSB", "False"))
+    is_big = _is_true(header, "ElementByteOrderMSB", "BinaryDataByteOrderMSB")
     dropped = [f"{name} of the header" for name in sorted(set(header) - _KNOWN_FIELDS)][:8]
     fields: dict[str, Any] = {
         "path": path,
-        "stored": np.dtype((">" if is_big.lower() == "true" else "<") + number_dtype).str,
+        "stored": np.dtype((">" if is_big else "<") + number_dtype).str,
         "shape": ((width,) if width > 1 else ()) + shape,
-        "info": _info(header, width, rank),
+        "info": _info(path, header, width, rank),
         "dropped": tuple(dropped),
         **_placement(path, header, shape, width),
     }
@@ -65,16 +66,17 @@ def open_metaimage(path: str) -> VolumeSource:
         )
     is_local = data_name.upper() == "LOCAL"
     data_file = path if is_local else str(Path(path).parent / data_name)
-    offset = end if is_local else int(header.get("HeaderSize", 0))
-    if header.get("BinaryData", "True").lower() != "true":
-        return TextSource(file=data_file, offset=offset, fortran=True, **fields)
-    if header.get("CompressedData", "False").lower() == "true":
-        fields |= {"codec": "zlib", "start": max(offset, 0), "whole": True, "exact": True}
+    header_size = int(header.get("HeaderSize", 0))
+    start = header_size if header_size > 0 else end if is_local else 0
+    if "BinaryData" in header and not _is_true(header, "BinaryData"):
+        return TextSource(file=data_file, offset=start, fortran=True, **fields)
+    if _is_true(header, "CompressedData"):
+        fields |= {"codec": "zlib", "start": start, "whole": True, "exact": True}
         return ArraySource(file=data_file, fortran=True, **fields)
-    if offset < 0:  # the numbers are at the end of the file
+    if header_size < 0:  # the numbers are at the end of the file
         needed_bytes = math.prod(fields["shape"]) * np.dtype(number_dtype).itemsize
-        offset = max(0, os.stat(data_file).st_size - needed_bytes)
-    return ArraySource(file=data_file, offset=offset, fortran=True, **fields)
+        start = max(0, os.stat(data_file).st_size - needed_bytes)
+    return ArraySource(file=data_file, offset=start, fortran=True, **fields)
 
 
 def _read_header(path: str) -> tuple[dict[str, str], int]:
@@ -99,24 +101,34 @@ def _read_header(path: str) -> tuple[dict[str, str], int]:
     raise ValueError("no MetaImage: the header has no ElementDataFile")
 
 
+def _is_true(header: dict[str, str], *names: str) -> bool:
+    """Returns whether the first field of `names` that the header has is true. MetaIO decides by its
+    first letter: "True", "T" and "1" are.
+    """
+    return next((header[name] for name in names if name in header), "")[:1] in ("T", "t", "1")
+
+
+def _numbers(path: str, header: dict[str, str], count: int, *names: str) -> np.ndarray | None:
+    """Returns the `count` numbers of the first field of `names` that the header has; None if it
+    has none of them.
+    """
+    text = next((header[name] for name in names if name in header), None)
+    values = np.array([float(v) for v in text.split()]) if text else None
+    if values is not None and len(values) != count:
+        raise ValueError(f"{path}: {names[0]} must be {count} numbers, got {text!r}")
+    return values
+
+
 def _placement(
     path: str, header: dict[str, str], shape: tuple[int, ...], width: int
 ) -> dict[str, Any]:
     """Returns axes and position of the array; its first axis counts channels, if it has several."""
     rank = len(shape)
-
-    def numbers(count: int, *names: str) -> np.ndarray | None:
-        text = next((header[name] for name in names if name in header), None)
-        values = np.array([float(v) for v in text.split()]) if text else None
-        if values is not None and len(values) != count:
-            raise ValueError(f"{path}: {names[0]} must be {count} numbers, got {text!r}")
-        return values
-
-    steps = numbers(rank, "ElementSpacing", "ElementSize")
+    steps = _numbers(path, header, rank, *_STEP_FIELDS)
     steps = np.ones(rank) if steps is None else steps
-    matrix = numbers(rank * rank, "TransformMatrix", "Rotation", "Orientation")
+    matrix = _numbers(path, header, rank * rank, "TransformMatrix", "Rotation", "Orientation")
     matrix = np.eye(rank) if matrix is None else matrix.reshape(rank, rank).T
-    offset = numbers(rank, "Offset", "Position", "Origin")
+    offset = _numbers(path, header, rank, *_OFFSET_FIELDS)
     affine, space = np.eye(4), min(rank, 3)
     affine[:space, :space] = (matrix * steps)[:space, :space]
     affine[:space, 3] = 0.0 if offset is None else offset[:space]
@@ -126,10 +138,14 @@ def _placement(
     return placement
 
 
-def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
+def _info(path: str, header: dict[str, str], width: int, rank: int) -> ImageInfo:
     """Returns the header's metadata of the values."""
-    modality, steps = header.get("Modality", ""), header.get("ElementSpacing", "").split()
-    step = float(steps[3]) if rank == len(steps) == 4 else 0.0
+    modality = header.get("Modality", "")
+    steps, offset = (_numbers(path, header, rank, *n) for n in (_STEP_FIELDS, _OFFSET_FIELDS))
+    step, origin = (
+        float(values[3]) if rank == 4 and values is not None and math.isfinite(values[3]) else 0.0
+        for values in (steps, offset)
+    )
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
     return ImageInfo(
         unit=length_unit(header.get("DistanceUnits", "mm")),
@@ -137,4 +153,5 @@ def _info(header: dict[str, str], width: int, rank: int) -> ImageInfo:
         channels=color_channels() if color else (),
         space="right-anterior-superior",
         time_step=step if step > 0 else None,
+        time_origin=origin,
     )

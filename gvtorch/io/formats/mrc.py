@@ -5,6 +5,7 @@ Source: Cheng et al., "MRC2014: extensions to the MRC format header", J. Struct.
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from ...base.image_info import ImageInfo
 from ...base.messages import one_line
-from ..source import ArraySource, Triple
+from ..source import ArraySource, place_axes
 from .format import Format
 
 _PACKED_ENDINGS = (".gz", ".bz2")
@@ -42,47 +43,54 @@ def open_mrc(path: str) -> ArraySource:
         raise ValueError(f"{path}: mode {int(fields['mode'])}; expected one of {sorted(_DTYPES)}")
     if int(fields["nsymbt"]) < 0:
         raise ValueError(f"{path}: an extended header of {int(fields['nsymbt'])} bytes")
-    axes = [int(fields[name]) for name in ("maps", "mapr", "mapc")]
-    axis_order = "zyx" if sorted(axes) != [1, 2, 3] else "".join("xyz"[axis - 1] for axis in axes)
-    spacing, origin, unit = _placement(fields)
     is_stack = int(fields["ispg"]) > 400 and int(fields["mz"]) > 0
     if is_stack:
         slices_per_map = int(fields["mz"])
         if sizes[0] % slices_per_map:
             raise ValueError(f"{path}: a stack of {sizes[0]} slices is not a whole number of maps")
-        sizes, axis_order = (
-            [sizes[0] // slices_per_map, slices_per_map, *sizes[1:]],
-            "t" + axis_order,
-        )
+        sizes = [sizes[0] // slices_per_map, slices_per_map, *sizes[1:]]
         dropped.append(f"that its {sizes[0]} maps are separate: they are read as time points")
+    affine, unit = _placement(fields)
     return ArraySource(
         path=path,
         file=path,
         shape=tuple(sizes),
-        axes=axis_order,
         stored=np.dtype(("<" if order in "<=|" else ">") + number_dtype).str,
         offset=1024 + int(fields["nsymbt"]),
         whole=path.lower().endswith(_PACKED_ENDINGS),
-        spacing=spacing,
-        origin=origin,
         info=ImageInfo(unit=unit),
         dropped=tuple(dropped),
+        **place_axes(path, affine, sizes, time=0 if is_stack else None),
     )
 
 
-def _placement(header: Any) -> tuple[Triple, Triple, str | None]:
-    """Returns voxel size and position of the first voxel, angstroms, x y z, and their unit."""
-    steps, starts = [], []
-    names = ("nxstart", "nystart", "nzstart")  # of columns, rows, sections
-    order = [int(header[name]) for name in ("mapc", "mapr", "maps")]
-    order = order if sorted(order) == [1, 2, 3] else [1, 2, 3]
-    for axis, letter in enumerate("xyz"):
-        cell, count = float(header["cella"][letter]), int(header[f"m{letter}"])
-        steps.append(cell / count if cell > 0 and count > 0 and np.isfinite(cell) else 0.0)
-        starts.append(int(header[names[order.index(axis + 1)]]))
-    has_steps = all(step > 0 for step in steps)
-    x, y, z = steps if has_steps else (1.0, 1.0, 1.0)
-    position = [float(header["origin"][letter]) for letter in "xyz"]
-    if not any(position) or not np.isfinite(position).all():
-        position = [start * step for start, step in zip(starts, (x, y, z), strict=True)]
-    return (x, y, z), (position[0], position[1], position[2]), "angstrom" if has_steps else None
+def _placement(header: Any) -> tuple[np.ndarray, str | None]:
+    """Returns (4, 4) the affine from section, row and column to angstroms, and the unit."""
+    order = [int(header[name]) for name in ("maps", "mapr", "mapc")]
+    order = [axis - 1 for axis in (order if sorted(order) == [1, 2, 3] else [3, 2, 1])]
+    cell = np.array([float(header["cella"][letter]) for letter in "xyz"])
+    counts = np.array([int(header[f"m{letter}"]) for letter in "xyz"])
+    has_steps = bool((np.isfinite(cell) & (cell > 0) & (counts > 0)).all())
+    affine, steps = np.eye(4), np.eye(3)
+    if has_steps:
+        steps = _cell_axes(header["cellb"]) * (cell / counts)
+    affine[:3, :3] = steps[:, order]
+    position = np.array([float(header["origin"][letter]) for letter in "xyz"])
+    if not position.any() or not np.isfinite(position).all():
+        position = affine[:3, :3] @ [int(header[f"n{axis}start"]) for axis in "zyx"]
+    affine[:3, 3] = position
+    return affine, "angstrom" if has_steps else None
+
+
+def _cell_axes(angles: Any) -> np.ndarray:
+    """Returns (3, 3), in columns, the directions of a cell's edges: the first along x, the second
+    in the plane of x and y. Angles that are not between 0 and 180 degrees are right ones.
+    """
+    degrees = [float(angles[name]) for name in ("alpha", "beta", "gamma")]
+    alpha, beta, gamma = (
+        0.0 if n == 90 or not 0 < n < 180 else math.cos(math.radians(n)) for n in degrees
+    )
+    sine = math.sqrt(1 - gamma**2)
+    y = (alpha - beta * gamma) / sine
+    z = math.sqrt(max(1 - beta**2 - y**2, 0))  # 0 if there is no such cell
+    return np.array([[1, gamma, beta], [0, sine, y], [0, 0, z]])

@@ -19,14 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..packed import blosc_begin, unpack_block
-from ..sparse_grid import (
-    COUNTS,
-    VOXELS,
-    SparseGrid,
-    SparseSource,
-    bits,
-    check_roots,
-)
+from ..sparse_grid import COUNTS, VOXELS, SparseGrid, SparseSource, bits, check_roots
 from .format import Format, choose
 
 _FILE_MAGICS = (b"NanoVDB0", b"NanoVDB2")
@@ -334,14 +327,7 @@ class NanoGrid(SparseGrid):
         is_child = bits(self.data, offset + 32 + n**3 // 8, n**3)
         return values.reshape(n, n, n, width), ~is_child.reshape(n, n, n)
 
-    def leaves(self, numbers: np.ndarray) -> np.ndarray:
-        out = np.empty((len(numbers), VOXELS, len(self.background)), self.dtype)
-        for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
-            out[row] = self._voxels(offset)
-        return out
-
-    def _voxels(self, offset: int) -> np.ndarray:
-        """Returns (512, c) the voxels of a leaf."""
+    def leaf(self, offset: int) -> np.ndarray:
         start = offset + self.layout.voxels_start
         if self.kind in ("Mask", "bool"):
             return bits(self.data, start, VOXELS)[:, None]

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb, color_channels
+from ...base.image_info import ChannelInfo, Rgb, color_channels
 from ...base.units import spacing_of
-from ..source import FileMetadata, Index, VolumeSource, read_planes
+from ..source import FileMetadata, Index, VolumeSource, microscope_info, read_planes
 from .format import Format, choose
 
 
@@ -92,10 +92,4 @@ def _read_metadata(file: Any, sizes: Mapping[str, int]) -> FileMetadata:
     )
     width = sizes.get("C", 1) * sizes.get("S", 1)
     dropped = ["regions of interest (ROI)"] if getattr(file, "rois", None) else []
-    info = ImageInfo(
-        unit=unit,
-        channels=tuple(channels) if len(channels) == width else (),
-        time_step=step,
-        time_unit="millisecond" if step else None,
-    )
-    return info, spacing, dropped
+    return microscope_info(unit, channels, width, step, "millisecond"), spacing, dropped

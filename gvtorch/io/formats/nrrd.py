@@ -31,16 +31,17 @@ _MAX_SKIPPED_BYTES = 1 << 24  # of one line, or of unpacked data
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
 _SPATIAL_KINDS = ("domain", "space")
+_UNCLEAR_KINDS = ("???", "none", "list", "stub")  # of axes that may count slices
 #: Fields of the format; others are key/value pairs of the file's writer.
 _FIELDS = {
-    *("type", "dimension", "sizes", "encoding", "endian", "data file", "datafile", "block size"),
-    *("byte skip", "byteskip", "line skip", "lineskip", "content", "sample units", "number"),
-    *("space", "space dimension", "space units", "space origin", "space directions", "spacings"),
-    *("kinds", "units", "labels", "centers", "centerings", "thicknesses", "axis mins", "axismins"),
-    *("axis maxs", "axismaxs", "sampleunits", "blocksize", "measurement frame", "min", "max"),
-    *("old min", "oldmin", "old max", "oldmax"),
+    *("type", "dimension", "sizes", "encoding", "endian", "data file", "block size", "byte skip"),
+    *("line skip", "content", "sample units", "number", "space", "space dimension", "space units"),
+    *("space origin", "space directions", "spacings", "kinds", "units", "labels", "centers"),
+    *("thicknesses", "axis mins", "axis maxs", "measurement frame", "min", "max", "old min"),
+    *("old max",),
 }
-_DROPPED_FIELDS = ("measurement frame", "old min", "oldmin", "old max", "oldmax")
+_OTHER_SPELLINGS = {name.replace(" ", ""): name for name in _FIELDS} | {"centerings": "centers"}
+_DROPPED_FIELDS = ("measurement frame", "old min", "old max")
 
 
 @Format("NRRD", ".nrrd", ".nhdr", options=("axes",), library="nrrd", package="pynrrd")
@@ -49,8 +50,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     import nrrd
 
     with open(path, "rb") as file:
-        header = nrrd.read_header(file)
+        fields = nrrd.read_header(file)
         offset = file.tell()
+    header = {_OTHER_SPELLINGS.get(name, name): value for name, value in fields.items()}
     shape = tuple(int(n) for n in header["sizes"])
     if header.get("dimension") != len(shape):
         raise ValueError(f"{path}: {len(shape)} sizes, dimension {header.get('dimension')}")
@@ -67,7 +69,7 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         raise ValueError(f"{path}: endian {header['endian']!r} is neither little nor big")
     axis_roles = _axis_roles(path, header, shape, axes)
     info, dropped = _info(header, axis_roles, shape)
-    fields: dict[str, Any] = {
+    fields = {
         "path": path,
         "shape": shape,
         "stored": np.dtype((">" if header.get("endian") == "big" else "<") + number_dtype).str,
@@ -78,9 +80,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
             *(axis_roles.index(role) if role in axis_roles else None for role in "ct"),
         ),
     }
-    data_name = header.get("data file", header.get("datafile"))
-    skip_bytes = int(header.get("byte skip", header.get("byteskip", 0)))
-    skip_lines = int(header.get("line skip", header.get("lineskip", 0)))
+    data_name = header.get("data file")
+    skip_bytes = int(header.get("byte skip", 0))
+    skip_lines = int(header.get("line skip", 0))
     if data_name is not None and (
         not isinstance(data_name, str) or data_name.startswith("LIST") or "%" in data_name
     ):
@@ -126,7 +128,7 @@ def _skip_lines(file: str, start: int, count: int) -> int:
 
 
 def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes: str | None) -> str:
-    """Returns the meaning of each axis: "s" space, "t" times, "c" components."""
+    """Returns the meaning of each axis: "x", "y", "z" space, "t" times, "c" components."""
     rank, kinds = len(shape), [str(kind).lower() for kind in header.get("kinds", ())]
     if rank < 3:
         raise ValueError(f"{path}: expected 3 axes of space, got {rank} axes")
@@ -143,11 +145,20 @@ def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes:
             )
             roles = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if roles.count("s") == 3 and roles.count("t") <= 1 and roles.count("c") <= 1:
-            return "".join(roles)
+            letters = iter("xyz")
+            return "".join(next(letters) if role == "s" else role for role in roles)
+        if set(kinds) - {*_SPATIAL_KINDS, *_UNCLEAR_KINDS}:
+            raise ValueError(
+                f"{path}: expected three axes of space, got kinds {', '.join(kinds)}; axes "
+                "(--axes) may name them otherwise"
+            )
     axis_order = ask_axes(path, shape[::-1], axes)[::-1]
     if sum(letter in "zyx" for letter in axis_order) != 3:
         raise ValueError(f"{path}: expected three axes of space, got {axis_order[::-1]}")
-    return "".join("s" if letter in "zyx" else letter for letter in axis_order)
+    in_order = "xyz" in axis_order.replace("c", "").replace("t", "")
+    if not in_order and np.isfinite(_directions(header, rank)).any():
+        raise ValueError(f"{path}: axes must be z, y, x in this order: its header directs them")
+    return axis_order
 
 
 def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
@@ -157,12 +168,9 @@ def _directions(header: dict[str, Any], rank: int) -> np.ndarray:
     return directions if is_valid else np.full((rank, 3), np.nan)
 
 
-def _numbers(header: dict[str, Any], rank: int, *names: str) -> np.ndarray:
-    """Returns (axes,) the numbers of the first field of `names` that the header has; NaN if it has
-    none, or not a number for each axis.
-    """
-    field = next((header[name] for name in names if name in header), np.zeros(0))
-    values = np.asarray(field, dtype=np.float64)
+def _numbers(header: dict[str, Any], rank: int, name: str) -> np.ndarray:
+    """Returns (axes,) the numbers of a field; NaN if the header lacks it, or not one per axis."""
+    values = np.asarray(header.get(name, ()), dtype=np.float64)
     return values if values.shape == (rank,) else np.full(rank, np.nan)
 
 
@@ -173,14 +181,10 @@ def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
     Source: NRRD format, sections "axis mins" and "centers"; values whose centering is not given
         count as those of cells, as in Teem.
     """
-    low = _numbers(header, rank, "axis mins", "axismins")
-    high = _numbers(header, rank, "axis maxs", "axismaxs")
-    centerings = header.get("centers", header.get("centerings", ""))
-    centerings = (
-        (centerings if isinstance(centerings, str) else " ".join(map(str, centerings)))
-        .lower()
-        .split()
-    )
+    low, high = (_numbers(header, rank, name) for name in ("axis mins", "axis maxs"))
+    centers = header.get("centers", "")
+    centers = centers if isinstance(centers, str) else " ".join(map(str, centers))
+    centerings = centers.lower().split()
     centerings = centerings if len(centerings) == rank else ["cell"] * rank
     in_cells = np.array([centering != "node" for centering in centerings])
     intervals = np.asarray(header["sizes"]) - ~in_cells
@@ -190,20 +194,20 @@ def _steps(header: dict[str, Any], rank: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _affine(header: dict[str, Any], axis_roles: str) -> np.ndarray:
-    """Returns (4, 4) the affine of the three axes of space."""
-    spatial = [axis for axis, role in enumerate(axis_roles) if role == "s"]
+    """Returns (4, 4) the affine of the three axes of space, in their order."""
+    spatial = [axis for axis, role in enumerate(axis_roles) if role in "xyz"]
+    world_axis = ["xyz".index(axis_roles[axis]) for axis in spatial]
     directions = _directions(header, len(axis_roles))[spatial, :3]
     spacings, first = (values[spatial] for values in _steps(header, len(axis_roles)))
     affine = np.eye(4)
-    if not np.isnan(directions).all():
-        affine[:3, :3] = directions.T
-    elif not np.isnan(spacings).all():
-        affine[:3, :3] = np.diag(np.where(np.isnan(spacings), 1, spacings))
+    affine[:3, :3] = directions.T
+    if np.isnan(directions).all():
+        affine[:3, :3] = np.eye(3)[:, world_axis] * np.where(np.isnan(spacings), 1, spacings)
     origin = np.asarray(header.get("space origin", np.zeros(3)), dtype=np.float64)
     if origin.shape in ((3,), (4,)) and not np.isnan(origin[:3]).all():
         affine[:3, 3] = origin[:3]
     if "space origin" not in header and np.isfinite(first).all():
-        affine[:3, 3] = first
+        affine[world_axis, 3] = first
     return affine  # `place_axes` refuses NaN and infinity
 
 
@@ -219,32 +223,28 @@ def _info(
     units = [str(unit) for unit in header.get("units", ())]
     units = units if len(units) == len(axis_roles) else [""] * len(axis_roles)
     spatial = [str(unit) for unit in header.get("space units", ())][:3]
-    spatial = spatial or [u for u, role in zip(units, axis_roles, strict=True) if role == "s"]
+    spatial = spatial or [u for u, role in zip(units, axis_roles, strict=True) if role in "xyz"]
     unit_names = {length_unit(unit) for unit in spatial}
     unit = unit_names.pop() if len(unit_names) == 1 else None
     if unit is None and any(spatial):
         dropped.append(f"units of space {', '.join(spatial)}")
-    step: float | None = None
-    step_unit = None
+    step, origin, step_unit = None, 0.0, None
     if "t" in axis_roles:
         time_axis = axis_roles.index("t")
-        steps = (
-            *_directions(header, len(axis_roles))[time_axis, 3:],
-            _steps(header, len(axis_roles))[0][time_axis],
-        )
-        step = next(
-            (float(candidate) for candidate in steps if np.isfinite(candidate) and candidate > 0),
-            None,
-        )
+        steps, first = (values[time_axis] for values in _steps(header, len(axis_roles)))
+        steps = (*_directions(header, len(axis_roles))[time_axis, 3:], steps)
+        step = next((float(n) for n in steps if np.isfinite(n) and n > 0), None)
+        origin = float(first) if np.isfinite(first) else 0.0
         step_unit = time_unit(units[time_axis]) if step else None
     space = str(header.get("space", "")).lower().removesuffix("-time")
     info = ImageInfo(
         unit=unit,
         channels=_channels(header, axis_roles, shape),
-        quantity=str(header.get("sample units", header.get("sampleunits", ""))) or None,
+        quantity=str(header.get("sample units", "")) or None,
         labels=any(str(name).startswith("Segment0_") for name in header),
         space=_SPACES.get(space, space) or None,
         time_step=step,
+        time_origin=origin,
         time_unit=step_unit,
     )
     return info, dropped

@@ -356,12 +356,7 @@ class VdbGrid(SparseGrid):
         )
         topology = _Topology(cursor, packing).read(kind, grid.leaves_start)
         return cls(
-            dtype=dtype,
-            background=background,
-            data=data,
-            kind=kind,
-            packing=packing,
-            **topology,
+            dtype=dtype, background=background, data=data, kind=kind, packing=packing, **topology
         )
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
@@ -375,20 +370,16 @@ class VdbGrid(SparseGrid):
             values[~is_child] = self.packing.values(cursor, active[~is_child])
         return values.reshape(n, n, n, -1), ~is_child.reshape(n, n, n)
 
-    def leaves(self, numbers: np.ndarray) -> np.ndarray:
-        out = np.empty((len(numbers), VOXELS, self.packing.width), self.dtype)
-        for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
-            cursor = Cursor(self.data, offset)
-            active = cursor.mask(VOXELS)
-            if self.kind == "mask":
-                out[row, :, 0] = active
-            elif self.kind == "bool":
-                cursor.skip(12)
-                out[row, :, 0] = cursor.mask(VOXELS)
-            else:
-                cursor.skip(0 if self.packing.has_masks else 13)
-                out[row] = self.packing.values(cursor, active)
-        return out
+    def leaf(self, offset: int) -> np.ndarray:
+        cursor = Cursor(self.data, offset)
+        active = cursor.mask(VOXELS)
+        if self.kind == "mask":
+            return active[:, None]
+        if self.kind == "bool":
+            cursor.skip(12)
+            return cursor.mask(VOXELS)[:, None]
+        cursor.skip(0 if self.packing.has_masks else 13)
+        return self.packing.values(cursor, active)
 
 
 class _Topology:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...base import check
 from ..source import ArraySource
 from .format import Format
 
@@ -46,16 +47,14 @@ def open_raw(
         raise ValueError(f"{path}: dtype must be an integer or a float, got {dtype_name!r}")
     if dtype is None and name_match:
         stored_dtype = stored_dtype.newbyteorder(">" if name_match[5] == "be" else "<")
-    if offset is not None and (type(offset) is not int or offset < 0):
-        raise ValueError(f"{path}: offset must be bytes, an int >= 0, got {offset!r}")
     return ArraySource(
         path=path,
         file=path,
-        shape=tuple(int(size) for size in shape),
+        shape=tuple(check.integer(path, "shape", size, low=0) for size in shape),
         axes="xyz",
         fortran=True,
         stored=stored_dtype.str,
-        offset=offset or 0,
+        offset=0 if offset is None else check.integer(path, "offset", offset, low=0),
         exact=offset is None,
         whole=path.lower().endswith((".gz", ".bz2")),
     )

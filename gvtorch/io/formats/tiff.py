@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +12,21 @@ import numpy as np
 from ...base import boxes
 from ...base.image_info import ImageInfo, color_channels
 from ..source import ArraySource, FileMetadata, Index, VolumeSource, read_planes
-from ..tiff_info import JPEG, check_pictures, imagej_info, ome_info, opened_tiff, tiff_messages
+from ..tiff_info import (
+    JPEG,
+    check_pictures,
+    imagej_info,
+    ome_info,
+    opened_tiff,
+    photometric_dropped,
+    tiff_messages,
+)
 from .format import Format, choose
 
-_PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
-    0: "that high values are meant to be dark (MinIsWhite)",
-    3: "the colours of its palette: values are numbers of its entries",
+#: What tifffile calls programs and standards with tags of their own, which are not read here.
+_OTHER_METADATA = {
+    *("andor", "epics", "fei", "fluoview", "geotiff", "lsm", "mdgel", "metaseries", "nih"),
+    *("scanimage", "sem", "sis", "stk", "tvips"),
 }
 
 
@@ -55,28 +63,15 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     planes, depth, length, width, samples = keyframe.shaped
     if planes != 1 or depth != 1 or len(page.dataoffsets) != math.prod(keyframe.chunked):
         return page.asarray()[index]
-    rows, columns = index[0], index[1]
-    tile_height, tile_width = (keyframe.tilelength, keyframe.tilewidth) if keyframe.is_tiled else (
-        keyframe.rowsperstrip, width,
-    )  # fmt: skip
-    tile_height, tiles_across = (
-        min(tile_height, length) if not keyframe.is_tiled else tile_height,
-        -(-width // tile_width),
-    )
-    out = np.zeros((rows.stop - rows.start, columns.stop - columns.start, samples), keyframe.dtype)
-    first, last = (rows.start, columns.start), (rows.stop, columns.stop)
-    tile_indices = itertools.product(
-        range(rows.start // tile_height, -(-rows.stop // tile_height)),
-        range(columns.start // tile_width, -(-columns.stop // tile_width)),
-    )
-    for tile_row, tile_column in tile_indices:
-        tile = _unpack_tile(page, keyframe, tile_row * tiles_across + tile_column)
-        if tile is None:
-            continue
-        corner = np.array((tile_row * tile_height, tile_column * tile_width))
-        tile = tile[: length - corner[0], : width - corner[1]]
-        low, high = np.maximum(first, corner), np.minimum(last, corner + tile.shape[:2])
-        out[boxes.index(low - first, high - first)] = tile[boxes.index(low - corner, high - corner)]
+    height, across = min(keyframe.rowsperstrip, length), width
+    if keyframe.is_tiled:
+        height, across = keyframe.tilelength, keyframe.tilewidth
+    low, high = zip(*((span.start, span.stop) for span in index[:2]), strict=True)
+    out = np.zeros((*np.subtract(high, low), samples), keyframe.dtype)
+    for row, column in boxes.tile_indices(low, high, (height, across)):
+        tile = _unpack_tile(page, keyframe, row * -(-width // across) + column)
+        if tile is not None:
+            boxes.paste(out, low, tile, (row * height, column * across))
     return out[..., index[2]] if len(index) == 3 else out[..., 0]
 
 
@@ -170,7 +165,7 @@ def _read_metadata(
     photometric = int(series.keyframe.photometric)
     is_color = width in (3, 4) and photometric in (2, 6)  # RGB, YCbCr
     channels = color_channels(width) if is_color else ()
-    dropped = [_PHOTOMETRIC_DROPPED[photometric]] if photometric in _PHOTOMETRIC_DROPPED else []
+    dropped = [*photometric_dropped(series)]
     if series.kind == "imagej":
         info, spacing, also_dropped = imagej_info(file.imagej_metadata, _resolution(file), width)
         return (
@@ -178,6 +173,8 @@ def _read_metadata(
             spacing,
             [*also_dropped, *dropped],
         )
+    if others := sorted(_OTHER_METADATA & file.pages[0].flags):
+        dropped.append(f"metadata of {', '.join(others)}, such as sizes of voxels")
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
         dropped.append("the size of a pixel in centimeters: the distance between pages is missing")

@@ -286,14 +286,11 @@ def _xml_place(
 
 
 def _open_legacy(path: str, key: str | None) -> VolumeSource:
-    with (
-        open(path, "rb") as file,
-        mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content,
-    ):
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         lines = content[:4096].split(b"\n", 4)
         if len(lines) < 5 or not lines[0].startswith(b"# vtk DataFile"):
             raise ValueError(f"{path}: is not a legacy VTK file")
-        if lines[3].split() != [b"DATASET", b"STRUCTURED_POINTS"]:
+        if lines[3].upper().split() != [b"DATASET", b"STRUCTURED_POINTS"]:
             dataset = lines[3][:60].decode("latin-1")
             raise ValueError(f"{path}: {dataset!r}; expected STRUCTURED_POINTS")
         binary = lines[2].strip().upper() == b"BINARY"
@@ -339,7 +336,9 @@ def _legacy_parts(
             len(tokens) == 4 and _legacy_type(tokens[3]) and field_arrays_left > 0
         ):
             array = _legacy_array(path, tokens, points, cells)
-            lookup_table = re.match(rb"LOOKUP_TABLE[^\n]*\n", content[position : position + 200])
+            lookup_table = re.match(
+                rb"(?i)LOOKUP_TABLE[^\n]*\n", content[position : position + 200]
+            )
             position += lookup_table.end() if lookup_table and name == "SCALARS" else 0
             arrays.append({**array, "offset": position})
             field_arrays_left -= name not in _ARRAY_KEYWORDS

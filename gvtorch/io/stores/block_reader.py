@@ -4,7 +4,6 @@ what is missing or was replaced is an error. `cut_blocks` cuts blocks out of any
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -18,12 +17,7 @@ from .checksums import Checksums, shard_path
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .level_reader import LevelReader
 from .store_layout import BORDER, CELL, StoreLayout
-from .tensorstores import (
-    Deadline,
-    StoreError,
-    begin_open,
-    read_key,
-)
+from .tensorstores import Deadline, StoreError, begin_open, read_key
 
 _BATCH_BLOCKS = 256  # blocks read at once; larger batches only cost memory traffic
 _BLOCKS_AHEAD = 2 * _BATCH_BLOCKS  # blocks being read at a time
@@ -179,12 +173,7 @@ class BlockReader:
         block[..., self._channels] = values
 
     def check_shards(
-        self,
-        spec: dict[str, Any],
-        data: np.ndarray,
-        low: Zyx,
-        high: Zyx,
-        deadline: Deadline,
+        self, spec: dict[str, Any], data: np.ndarray, low: Zyx, high: Zyx, deadline: Deadline
     ) -> None:
         """Raises StoreError if a shard of `data`, items `low` to `high` of an array, is not the one
         that was written, or if zeros come from a missing shard: these arrays are written in full,
@@ -196,8 +185,7 @@ class BlockReader:
         shape = shape[len(time_index) :]
         space_axis = len(shape) == 4  # c, z, y, x
         side = shape[space_axis]
-        spans = [range(a // side, (b - 1) // side + 1) for a, b in zip(low, high, strict=True)]
-        shard_indices = [*itertools.product(*spans)]
+        shard_indices = [*boxes.tile_indices(low, high, [side] * 3)]
         for shard_index in () if is_coarse else shard_indices:
             self._checksums.check(spec, shard_index, deadline)
         for shard_index in shard_indices:

@@ -27,13 +27,7 @@ from ..resources import amount
 from .ngff import read_json_file
 from .shard import begin_write, bordered, create_array, finish_write
 from .store import Store
-from .store_layout import (
-    BORDER,
-    WORK,
-    CoarseChannel,
-    StoreLayout,
-    is_name,
-)
+from .store_layout import BORDER, WORK, CoarseChannel, StoreLayout, is_name
 from .unfinished import group_metadata, locked, write_json
 
 _CUBE_SIDE = 128  # voxels along a side of the cubes that are written at once

@@ -10,12 +10,7 @@ import dataclasses
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from concurrent.futures import (
-    BrokenExecutor,
-    Executor,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-)
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -90,7 +85,7 @@ def convert(
         resume: Continue a half-written store. A finished one is returned as it is, if its grid,
             dtype, block and threshold are those requested; its voxels are not compared.
         progress: Called with ("converting", bytes done, bytes in all).
-        **options: shape, dtype, key and axes, as for `read_volume`.
+        **options: shape, dtype, offset, key and axes, as for `read_volume`.
 
     Returns:
         The store, open.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +21,7 @@ from ...base.volume import Volume
 from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
 from ..label_source import IndexSource
-from ..oblique import Oblique
+from ..oblique import Oblique, StraightSource
 from ..reading import FormatSettings, open_source, read_time_points, with_placement
 from ..source import MemorySource, VolumeSource, no_time_message
 from . import shard, unfinished
@@ -93,6 +94,9 @@ def source_of(
     False; it then holds only the time points to be written.
     """
     check.known_options("convert", options, FormatSettings)
+    given = [name for name, value in options.items() if value is not None]
+    if given and isinstance(source, (VolumeSource, Volume)):
+        raise ValueError(f"convert: {', '.join(given)} is for files and arrays, not for volumes")
     if isinstance(source, VolumeSource):
         return source
     if isinstance(source, Volume):
@@ -297,14 +301,20 @@ def check_room(target: Path, estimate: Estimate) -> None:
 
 
 def _fingerprint(user_source: Any, source: VolumeSource) -> list[Any]:
+    """Returns values that are equal while a source, and what is read of it, are unchanged."""
     fingerprint = source.fingerprint()
     if fingerprint is not None:
         return fingerprint
     if isinstance(user_source, Volume):
         return unfinished.fingerprint(user_source)
-    if isinstance(user_source, (str, Path)):
-        return unfinished.fingerprint(source.path)
+    is_file = isinstance(user_source, (str, Path))
     fields: list[Any] = [list(source.shape), source.stored]
-    return fields + (
-        [unfinished.checksum([source.data])] if isinstance(source, MemorySource) else []
-    )
+    fields = unfinished.fingerprint(source.path) if is_file else fields
+    while isinstance(source, (IndexSource, StraightSource)):
+        source = source.inner
+    if isinstance(source, MemorySource):
+        return [*fields, unfinished.checksum([source.data])]
+    if (file := getattr(source, "file", source.path)) != source.path:  # beside its header
+        fields += unfinished.fingerprint(file)
+    # What is read of it: the chosen array, its axes, byte order, ...
+    return [*fields, zlib.crc32(repr(source).replace(source.path, "").encode())]

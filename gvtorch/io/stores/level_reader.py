@@ -7,7 +7,6 @@ less. Computed tiles are cached, in bounded memory.
 
 from __future__ import annotations
 
-import itertools
 import math
 import threading
 from collections import OrderedDict
@@ -24,13 +23,7 @@ from ..source import no_time_message
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MAX_STORE_VOXELS, StoreLayout
-from .tensorstores import (
-    Deadline,
-    StoreError,
-    begin_open,
-    child,
-    one_line_error,
-)
+from .tensorstores import Deadline, StoreError, begin_open, child, one_line_error
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE_SIDE = 64  # voxels along a side of a tile that is computed on demand
@@ -214,15 +207,9 @@ class LevelReader:
     def _read_tiles(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         size = [b - a for a, b in zip(low, high, strict=True)]
         out = np.empty((*size, self.width), self._layout.dtype)
-        spans = [
-            range(a // _TILE_SIDE, -(-b // _TILE_SIDE)) for a, b in zip(low, high, strict=True)
-        ]
-        for tile_index in itertools.product(*spans):
+        for tile_index in boxes.tile_indices(low, high, [_TILE_SIDE] * 3):
             tile = self._tile(level, tile_index, deadline)
-            corner = np.multiply(tile_index, _TILE_SIDE)
-            begin, end = np.maximum(low, corner), np.minimum(high, corner + tile.shape[:3])
-            part = tile[boxes.index(begin - corner, end - corner)]
-            out[boxes.index(begin - low, end - low)] = part
+            boxes.paste(out, low, tile, [_TILE_SIDE * i for i in tile_index])
         return out
 
     def _tile(self, level: int, tile_index: Zyx, deadline: Deadline) -> np.ndarray:

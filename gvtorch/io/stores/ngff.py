@@ -15,23 +15,11 @@ from reprlib import repr as brief
 from typing import Any
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
-from ...base.units import metres
+from ...base.units import length_unit, metres, time_unit
 from ..http import Endless
 from ..remote import is_file_url
-from .store_layout import (
-    JOURNAL,
-    MANIFEST,
-    RESUME_ADVICE,
-    WORK,
-    StoreLayout,
-    is_number,
-)
-from .tensorstores import (
-    MAX_JSON_BYTES,
-    Deadline,
-    child,
-    read_key,
-)
+from .store_layout import JOURNAL, MANIFEST, RESUME_ADVICE, WORK, StoreLayout, is_number
+from .tensorstores import MAX_JSON_BYTES, Deadline, child, read_key
 
 CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
 _MAX_LEVELS = 64
@@ -299,14 +287,14 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
         times.append((time_scale, time_offset))
     name = item.get("name")
     channels, damaged = _read_channels(omero) if omero is not None else ((), [])
-    (step, origin), time_unit = times[0], units.get("t")
-    has_time_step = "t" in axes and (time_unit is not None or step != 1)
+    (step, origin), step_unit = times[0], units.get("t")
+    has_time_step = "t" in axes and (step_unit is not None or step != 1)
     info = ImageInfo(
         unit=units.get("x"),
         channels=channels,
         time_step=step if has_time_step else None,
         time_origin=origin if "t" in axes else 0.0,
-        time_unit=time_unit,
+        time_unit=step_unit,
     )
     image_name = name if isinstance(name, str) else "image"
     return MultiscaleImage(
@@ -348,8 +336,8 @@ def _parse_axes(location: str, axes: Any) -> tuple[str, dict[str, str], list[str
         letter = name.lower() if name.lower() in ("t", "c", "z", "y", "x") else None
         letter = letter or {"time": "t", "channel": "c"}.get(str(kind), "-")
         axis_order += letter
-        if isinstance(unit, str):
-            units[letter] = unit
+        if isinstance(unit, str):  # writers also spell it in other ways than NGFF
+            units[letter] = (time_unit if letter == "t" else length_unit)(unit) or unit
     named_axes = axis_order.replace("-", "")
     if len(set(named_axes)) != len(named_axes) or not {"y", "x"} <= set(named_axes):
         names = ", ".join(brief(a.get("name") if isinstance(a, dict) else a) for a in axes[:8])

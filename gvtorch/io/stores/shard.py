@@ -21,18 +21,8 @@ from .block_reader import needed_cells
 from .checksums import shard_checksums
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
-from .store_layout import (
-    BORDER,
-    CELL,
-    RESUME_ADVICE,
-    StoreLayout,
-)
-from .tensorstores import (
-    Deadline,
-    StoreError,
-    begin_open,
-    one_line_error,
-)
+from .store_layout import BORDER, CELL, RESUME_ADVICE, StoreLayout
+from .tensorstores import Deadline, StoreError, begin_open, one_line_error
 from .unfinished import TaskResult
 
 _TIMEOUT = 3600.0  # seconds for one read of local data

@@ -24,20 +24,8 @@ from .checksums import json_checksum
 from .chunk_files import begin_read
 from .level_reader import LevelReader, Pool, keep_channels, open_arrays
 from .ngff import find_image, read_json
-from .store_layout import (
-    BORDER,
-    CELL,
-    DTYPES,
-    CoarseChannel,
-    StoreLayout,
-    value_dtype,
-)
-from .tensorstores import (
-    Deadline,
-    begin_open,
-    child,
-    kvstore,
-)
+from .store_layout import BORDER, CELL, DTYPES, CoarseChannel, StoreLayout, value_dtype
+from .tensorstores import Deadline, begin_open, child, kvstore
 
 _OPEN_TIMEOUT = 20.0  # seconds
 

@@ -8,11 +8,11 @@ import re
 import time
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 from ...base.whole_file import text_path
 from ..http import Endless, file_url, is_http, read_http
 from ..relay import read_within, relay_folder, with_urls
+from ..remote import local_path
 from ..resources import cores
 from .store_layout import WRITE_ZEROS
 
@@ -95,9 +95,7 @@ def kvstore(location: str | Path) -> Any:
     Links and ".." in a path are resolved as the operating system does; a path that tensorstore
     can't take, such as one that is not UTF-8, is replaced by a link to it (`text_path`).
     """
-    text = str(location)
-    if text.startswith("file://"):
-        text = unquote(urlsplit(text).path)
+    text = local_path(str(location))
     if re.match(r"[a-z0-9+]{2,}://", text):
         return text if text.endswith("/") or "?" in text else text + "/"
     path = text_path(os.path.realpath(text))

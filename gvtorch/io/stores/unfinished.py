@@ -22,13 +22,7 @@ from ...base.volume import Volume, movable
 from ...base.whole_file import durable_file, name_in_errors, rename
 from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
 from .ngff import image_metadata, read_json_file
-from .store_layout import (
-    GROUPS,
-    JOURNAL,
-    MANIFEST,
-    WORK,
-    StoreLayout,
-)
+from .store_layout import GROUPS, JOURNAL, MANIFEST, WORK, StoreLayout
 
 Task = tuple[int, ...]  # level, z, y, x, or level, t, z, y, x
 _LOCK = "lock"
@@ -186,8 +180,8 @@ def _check_settings(target: Path, settings: dict[str, Any]) -> None:
     if previous.get("fingerprint") != current["fingerprint"]:
         raise ValueError(
             f"{target}: the source is not the one that it was begun with "
-            f"({previous.get('source')}): size or time of change differ; remove the store to begin "
-            "again"
+            f"({previous.get('source')}): its size, time of change or what is read of it differ; "
+            "remove the store to begin again"
         )
     for key, value in current.items():
         if key != "source" and previous.get(key) != value:
@@ -246,7 +240,7 @@ def checksum(arrays: Iterable[np.ndarray]) -> int:
     """Returns the CRC-32 of the bytes of arrays, one after the other."""
     total = 0
     for array in arrays:
-        total = zlib.crc32(array.tobytes(), total)
+        total = zlib.crc32(np.ascontiguousarray(array).data, total)
     return total
 
 
