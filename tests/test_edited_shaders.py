@@ -107,3 +107,15 @@ def test_colour_and_channel_of_a_surface_are_edited_one_after_the_other(blobs):
     surface.other = "value"
     expected = gv.render(tree, camera(8), gv.Isosurface(0.5, GRAY, color_channel="value"))
     assert torch.equal(gv.render(tree, camera(8), surface).color, expected.color)
+
+
+def test_attributes_have_the_names_of_the_arguments():
+    surface = gv.Isosurface(0.5, None, color_channel="rgba", color_component=2)
+    assert (surface.color_channel, surface.color_component) == ("rgba", 2)
+    surface.color_channel, surface.color_component = "other", 1
+    assert (surface.other, surface.other_component) == ("other", 1)
+    with pytest.raises(ValueError, match="must be an int >= 0"):
+        surface.color_component = -1
+    field = gv.DistanceField(offset=0.2)
+    field.offset = 0.4
+    assert (field.value, field.offset) == (0.4, 0.4)

@@ -13,6 +13,7 @@ from helpers.traces import trace
 from torch import Tensor
 
 import gvtorch as gv
+from gvtorch.base.constants import ABSENT
 from gvtorch.tracing.tracer import Tracer
 
 
@@ -22,6 +23,9 @@ def looks(*components: int) -> list[gv.ChannelLook]:
 
 
 SUN = gv.DirectionalLight((1.0, -1.0, 0.0), (1.0, 0.9, 0.8))
+FAINT = gv.TransferFunction.from_points(
+    [(20, 0), (250, 0.03)], [(20, 1, 0.3, 0.1), (250, 0.2, 0.6, 1)]
+)
 WIDE_SUN = gv.DirectionalLight((0.3, -1.0, 0.6), angle=20.0)
 SHADERS = {
     "plain": TRANSFER,
@@ -96,10 +100,10 @@ def test_every_bit_is_the_reference_s(of_instructions, instructions, name, branc
     assert sum(len(a.unique()) for a in actual) > 1000, "the test must see something"
 
 
-def check_bits(tree: gv.N3Tree, size: int, shader: gv.Shader, **options) -> None:
+def check_bits(tree, size: int, shader: gv.Shader, lods=("auto", "finest"), **options) -> None:
     """Checks that pictures have the reference's bits."""
     rays = camera_rays(tree, size, distance=1.4)
-    for lod in ("auto", "finest"):
+    for lod in lods:
         (a, marks_a), (b, marks_b) = (
             trace(tree, backend, rays, shader, lod=lod, **options)
             for backend in ("cpp", "reference")
@@ -126,6 +130,32 @@ def test_a_pool_of_one_brick_is_read(name, dtype, brick):
     tree = gv.N3Tree.from_volume(volumes, brick)
     assert tree.bricks.capacity == 1
     check_bits(tree, 9, SHADERS[name])
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    "shader",
+    [FAINT, gv.Lit(FAINT), gv.StoredColor("rgba", reference=30.0), gv.Features(FAINT, "rgba")],
+    ids=["plain", "lit", "stored colour", "features"],
+)
+def test_constant_nodes_beside_the_one_brick_of_a_pool(shader):
+    """Packets read constant nodes, but not the brick: it is too large to be copied for few rays."""
+    numbers = torch.full((32, 32, 64, 4), 90, dtype=torch.uint8)
+    generator = torch.Generator().manual_seed(3)
+    numbers[:, :, :31] = torch.randint(0, 255, (32, 32, 31, 4), generator=generator)
+    volumes = {"value": gv.Volume(numbers[..., 1]), "rgba": gv.Volume(numbers)}
+    tree = gv.N3Tree.from_volume(volumes, 32)
+    pool, brick_tn = tree.bricks, tree.nodes.brick_tn.view(-1)
+    brick_tn[tree.root] = ABSENT
+    (node,) = (brick_tn >= 0).nonzero()[:, 0].tolist()
+    for channel, bricks in pool.bricks.items():
+        pool.bricks[channel] = bricks[brick_tn[node]][None].clone()
+    for key, field in pool.fields.items():
+        if key in vars(pool):
+            setattr(pool, key, field[:1].clone())
+    pool.in_order()
+    brick_tn[node] = 0
+    check_bits(tree, 9, shader, lods=("finest",))
 
 
 @pytest.mark.backend("cpp")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from operator import attrgetter
 from typing import Any, ClassVar
 
 from . import check
@@ -79,3 +80,8 @@ def flag(owner: Any, name: str, value: Any) -> bool:
     if not isinstance(value, bool):
         raise ValueError(f"{class_name(owner)}: {name} must be true or false, got {value!r}")
     return value
+
+
+def also_called(name: str) -> Any:
+    """Returns a property that is another name of an attribute."""
+    return property(attrgetter(name), lambda owner, value: setattr(owner, name, value))

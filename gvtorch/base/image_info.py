@@ -79,8 +79,8 @@ class ImageInfo:
     labels: bool = False  # values are label numbers, which must not be blended
     space: str | None = None  # where x, y, z point: "right-anterior-superior", ...
     pose: Rows | None = None  # (4, 4) to the world from the axes of oblique voxels kept as they are
-    time_step: float | None = None  # from one time point to the next
-    time_origin: float = 0.0  # of the first time point
+    time_step: float | None = None  # from one time point to the next, in `time_unit`
+    time_origin: float = 0.0  # of the first time point, in `time_unit`
     time_unit: str | None = None  # as OME-NGFF spells it: "second", ...
 
     def __post_init__(self) -> None:

@@ -67,16 +67,16 @@ class Rays:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Hits:
-    """The results of tracing rays."""
+    """The results of tracing rays; floats are of the dtype that the rays were traced in."""
 
     color: Tensor  # (r, 3) linear RGB, premultiplied by alpha
-    alpha: Tensor  # (r, 1)
+    alpha: Tensor  # (r, 1) 0 to 1
     depth: Tensor  # (r, 1) distance along the ray in world units, +inf where nothing was hit
     samples: Tensor  # (r,) int32, positions at which the shader was evaluated
     missed: Tensor  # (r,) bool, true where a node or brick that the ray wanted was missing
     # Only some shaders give these, else None:
     normal: Tensor | None = None  # (r, 3) world, towards the eye, of unit length or 0
-    features: Tensor | None = None  # (r, c)
+    features: Tensor | None = None  # (r, c) what the shader sums along the ray, as `Features`
     label: Tensor | None = None  # (r, 1) int64, at the depth; -1 where nothing was hit
 
     def to(

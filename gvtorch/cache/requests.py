@@ -71,8 +71,9 @@ class Requests:
 
 
 def levels_wanted(priority: Tensor, branching: int) -> Tensor:
-    """Returns (MAX_EXTRA_LEVELS + 1,) int64 how many subdivisions there are, with priorities (k,),
-    -1 for none, and how many of them want at least one more level, and two; see `extra_levels`.
+    """Counts requests to subdivide, whose priorities are (k,), -1 where there is none. Returns
+    (MAX_EXTRA_LEVELS + 1,) int64: all; those that want at least one more level; at least two. See
+    `extra_levels`.
     """
     widths = [0, *(_PIXEL_PRIORITY * branching**level for level in range(1, MAX_EXTRA_LEVELS + 1))]
     return torch.stack([priority >= width for width in widths]).sum(1)

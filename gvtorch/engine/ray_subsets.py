@@ -3,10 +3,9 @@
 A ray that missed nothing is done; the others are traced again. The first passes trace scouts alone:
 one ray per 16 x 16 pixels while the tree is coarse, then per 4 x 4. A brick is wider than that on
 the screen, so scouts miss almost all that the others would, for a sixteenth of the work. Then all
-rays that are not done follow. Where the pools are full of what these rays use and none of them gets
-done, fewer are traced, which frees what the others used: half as many each time nothing changes,
-twice as many after a subset is done. Source: the original engine suspends rays and takes several
-passes for quality; Crassin, PhD thesis 2011.
+rays that are not done follow. If the pools are full and no ray gets done, half as many are traced,
+and the slots of what the others used become free; after a subset is done, twice as many. Source:
+the original engine suspends rays and takes several passes for quality; Crassin, PhD thesis 2011.
 """
 
 from __future__ import annotations

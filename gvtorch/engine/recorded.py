@@ -22,7 +22,7 @@ from ..tracing.pixels import View
 from .production import Production
 from .stats import COARSER_UNIT, Collected, FrameStats, Readbacks
 
-_MAX_LISTED_NODES = 1 << 14  # most nodes whose requests are listed, unless a batch holds more
+_MIN_LIST = 1 << 14  # how many nodes' requests are listed, unless a batch holds more
 # Factors: most by which a frame widens cones, by which it narrows them, and widest cones.
 _MAX_WIDENING, _NARROWING = 1.2, 0.97
 _MAX_CONE_FACTOR = 64.0
@@ -52,8 +52,8 @@ class SlotCounts(NamedTuple):
 
 
 class RecordedFrame(ABC):
-    """What `DeviceFrame` and `HostFrame` share. A frame is `serve` if `begin` says so, `draw`, then
-    `look_ahead` where its camera moves, then `finish`.
+    """What `DeviceFrame` and `HostFrame` share. A frame calls `begin`; `serve`, if `begin` returned
+    true; `draw`; `look_ahead`, while the camera moves; and `finish`.
 
     Attributes:
         batch: Most bricks, and most node tiles, that are chosen in a frame.
@@ -67,7 +67,7 @@ class RecordedFrame(ABC):
         self._production, self.batch = production, batch
         self.trees = [*production.trees.values()]
         self.cache = cache = production.cache
-        self._list_capacity = min(max(_MAX_LISTED_NODES, batch), cache.nodes.request_tn.numel())
+        self._list_capacity = min(max(_MIN_LIST, batch), cache.nodes.request_tn.numel())
         device = cache.frame_1.device
         # Requests of the last picture, and of the look-ahead: nodes and their words.
         self._requests = torch.zeros((2, 2, self._list_capacity), dtype=torch.int32, device=device)
@@ -95,7 +95,7 @@ class RecordedFrame(ABC):
 
     @abstractmethod
     def serve(self) -> None:
-        """Writes what earlier frames missed."""
+        """Writes the bricks and node tiles that earlier frames requested."""
 
     def take_host_needed(self, readbacks: Readbacks) -> bool:
         """Returns whether `Engine.frame` must render the next frame, because it names the nodes

@@ -9,6 +9,7 @@ import statistics
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable
+from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -20,11 +21,31 @@ from ..cache import KINDS, RequestList
 from ..cache.requests import extra_levels
 
 _MAX_FRAMES_AHEAD = 3  # most frames that the host may be ahead of the device
-#: Fields of `FrameStats` that are known when the device has finished the frame.
-_DEVICE_FIELDS = {"milliseconds", "stages", "samples", "tiles_used", "bricks_used"}
-_DEVICE_FIELDS |= {"requests", "misses", "overflow", "converged", "ahead", "coarser"}
 COARSER_UNIT = 1 << 20  # 1.0 in `Counts.coarser`, which is fixed-point
 _settle_lock = threading.RLock()  # one thread completes statistics, others wait for it
+
+
+class _Waits:
+    """A field of `FrameStats` that is known when the device has finished the frame: reading it
+    waits for that.
+    """
+
+    def __init__(self, default: Any) -> None:
+        self.default = default
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = "_" + name
+
+    def __get__(self, stats: FrameStats | None, owner: type) -> Any:
+        return self if stats is None else vars(stats.settle())[self.name]
+
+    def __set__(self, stats: FrameStats, value: Any) -> None:
+        vars(stats)[self.name] = copy(self.default) if value is self else value
+
+
+def waits(default: Any) -> Any:
+    """Declares a field of `FrameStats` that waits for the device when it is read."""
+    return _Waits(default)
 
 
 @dataclass(kw_only=True, repr=False)
@@ -32,18 +53,23 @@ class FrameStats(RenderStats):
     """What a frame of the engine cost, and what it requested.
 
     Times (on CUDA the device's) and what rays used and missed are known when the device has
-    finished the frame: reading one of these fields waits for it; `settle` waits for all. `produced`
-    counts answers to requests of the previous frame and of this frame's scouts, and answers that
-    came late. `requests` and `deferred` include those of scouts; use, misses and samples are those
-    of the picture alone.
+    finished the frame: reading one of these fields, declared by `waits`, waits for it, as `settle`
+    does. `produced` counts answers to requests of the previous frame and of this frame's scouts,
+    and answers that came late. `requests` and `deferred` include those of scouts; use, misses and
+    samples are those of the picture alone.
     """
 
-    requests: dict[str, int] = field(default_factory=dict)  # by kind: load, subdivide
-    misses: int = 0  # nodes that rays missed, including pending ones
-    overflow: int = 0  # requested nodes that did not fit into the list
-    converged: bool = False  # nothing that could be served was missing
-    ahead: int = 0  # nodes that only look-ahead rays missed; see `Engine.capture`
-    coarser: float = 1.0  # factor by which cones were wider, so that the view fits the pools
+    milliseconds: float = waits(0.0)  # from the first stage to the last, on CUDA the device's
+    stages: dict[str, float] = waits({})  # noqa: RUF009  milliseconds by stage
+    samples: int = waits(0)  # positions at which the shader was evaluated
+    tiles_used: int = waits(0)  # node tiles that rays passed through
+    bricks_used: int = waits(0)  # bricks that rays sampled
+    requests: dict[str, int] = waits({})  # noqa: RUF009  by kind: load, subdivide
+    misses: int = waits(0)  # nodes that rays missed, including pending ones
+    overflow: int = waits(0)  # requested nodes that did not fit into the list
+    converged: bool = waits(False)  # nothing that could be served was missing
+    ahead: int = waits(0)  # nodes that only look-ahead rays missed; see `Engine.capture`
+    coarser: float = waits(1.0)  # factor by which cones were wider, so that the view fits the pools
 
     frame: int = 0  # number of the frame, from 1
     frames: int = 1  # frames that this picture took
@@ -64,17 +90,14 @@ class FrameStats(RenderStats):
         self._completions: tuple[Callable[[], None], ...] = ()
         self._is_settling = False  # a thread is completing them
 
-    def __getattribute__(self, name: str) -> Any:
-        if name in _DEVICE_FIELDS and (self._completions or self._is_settling):
-            self.settle()
-        return super().__getattribute__(name)
-
     def later(self, complete: Callable[[], None]) -> None:
         """Lets `settle` call `complete`, which waits for the device and sets fields."""
         self._completions = (*self._completions, complete)
 
     def settle(self) -> FrameStats:
         """Waits until the device has finished the frame; returns the statistics, now complete."""
+        if not (self._completions or self._is_settling):
+            return self
         with _settle_lock:
             if self._completions:
                 self._is_settling = True

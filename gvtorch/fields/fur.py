@@ -50,7 +50,8 @@ class Fur(OfShape):
             shape: The shape that they grow on.
             length: Height at which the value reaches 1, in world units.
             frequency: Hairs per world unit.
-            fall: Displacement of a tip one length high, in lengths; below, times height squared.
+            fall: How far a hair's tip hangs down, in hair lengths (x, y, z); at a share h of the
+                height, h^2 times as far.
             seed: Seed of the noise.
         """
         super().__init__()

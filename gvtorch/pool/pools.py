@@ -27,9 +27,9 @@ class Channel:
     above the finest level: it says more about the finest voxels below each coarse voxel.
     """
 
-    dtype: torch.dtype = torch.float32
-    width: int = 1
-    coarse: bool = False
+    dtype: torch.dtype = torch.float32  # of the numbers: integers of 8 or 16 bits, floats to 32
+    width: int = 1  # numbers in a voxel
+    coarse: bool = False  # whether only coarse bricks have it
 
     def __post_init__(self) -> None:
         """Checks the fields."""

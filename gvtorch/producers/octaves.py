@@ -17,9 +17,9 @@ from .producer import Nodes, Producer, by_depth
 class OctaveProducer(Producer):
     """Makes bricks of a `gv.noise.SplineSum` or `gv.noise.OctaveSum`, or of a function of it.
 
-    A level holds the sum of the octaves that its voxels can represent. If children can't inherit
-    the voxels' values themselves, the channel "inherited" holds what they inherit. Cells begin at
-    the low corner of the box.
+    A level holds the sum of the octaves that its voxels can represent. If the voxels hold a
+    function of the sum that can't be inverted, a second channel, "inherited", holds the sum, which
+    the children continue. Cells begin at the low corner of the box.
 
     Attributes:
         total: The sum.

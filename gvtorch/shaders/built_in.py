@@ -14,7 +14,16 @@ from typing import Any, ClassVar, Literal, Self, Unpack
 import torch
 
 from ..base import check
-from ..base.checked import Check, class_name, flag, instance_of, name_text, optional, positive
+from ..base.checked import (
+    Check,
+    also_called,
+    class_name,
+    flag,
+    instance_of,
+    name_text,
+    optional,
+    positive,
+)
 from ..ops import ShadeArguments
 from ..ops.shading import (
     COLOR_WIDTH,
@@ -57,9 +66,10 @@ _WHITE = TransferFunction.from_points([(0, 1)])
 _COLOR_CHECK = a_triple(low=0, high=1)
 _PROJECTIONS = {name: name for name in ("maximum", "minimum", "mean")}
 _PROJECTIONS |= {"max": "maximum", "min": "minimum"}
-# For `WideIsosurface`: rows of its table; width of its ramp in intervals, fitted so that penumbras
-# agree best; largest width of a distance field's ramp in voxels.
-_RAMP_ROWS, _RAMP_INTERVALS, _MAX_RAMP_VOXELS = 1025, 3.0, 16
+# Of `WideIsosurface`:
+_RAMP_ROWS = 1025  # of its table
+_RAMP_INTERVALS = 3.0  # width of its ramp; fitted so that penumbras agree best
+_MAX_RAMP_VOXELS = 16  # largest width of a distance field's ramp
 _OPAQUE_LENGTH = 1e-20  # a reference length so short that any opacity above 0 becomes 1
 
 
@@ -223,6 +233,8 @@ class Isosurface(LitShader):
     kind = "Isosurface"
     distance = False  # the value is a distance in world units, negative inside
     color: Triple | TransferFunction | None
+    color_channel = also_called("other")
+    color_component = also_called("other_component")
     checks: ClassVar[Mapping[str, Check]] = {
         "value": a_number(),
         "color": lambda owner, name, value: (
@@ -328,6 +340,7 @@ class DistanceField(Isosurface):
     """
 
     distance = True
+    offset = also_called("value")
 
     def __init__(
         self,
@@ -384,8 +397,8 @@ class WideIsosurface(Shader):
             pack((self.color, 0.0), dtype, device).expand(sampling.levels, _RAMP_ROWS, 4).clone()
         )
         fraction_lm = (0.5 + inside_m / (2 * half_ramp_l[:, None])).clamp(0, 1)
-        # A cone that grazes a surface meets it in several intervals: each lets through the fourth
-        # root of the transmittance.
+        # A cone that grazes a surface meets it in about four intervals, so each gets a quarter of
+        # the optical depth.
         table[:, :, 3] = 1 - (1 - fraction_lm).sqrt().sqrt()
         visible_m = (table[:, :, 3] > 0).any(0)
         return ColorTable(
@@ -432,7 +445,8 @@ class Projection(Shader):
 
 class Features(Shader):
     """All c numbers of a channel, composited front to back with the transfer function's alpha and
-    returned as `Hits.features` (r, c). c may be any number.
+    returned as `Hits.features` (r, c). c may be any number. `other` is the name of this channel;
+    `channel`, as of every shader, is that of the density.
     """
 
     kind = "Features"

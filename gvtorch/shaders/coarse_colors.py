@@ -70,10 +70,11 @@ def write_colors(
     float16 each: for each of `DIRECTIONS`, the n numbers (COLOR_WIDTH or LIT_COLOR_WIDTH) of a
     voxel seen in it, over a length of the smallest spacing, and the share of light that reached it.
 
-    Columns are weighted by the light that reaches them in a voxel. With `all_light` everything
-    before the voxel dims it, so that a row of voxels transmits what its columns do. This suits
-    translucent matter, which looks much the same to an oblique ray. In opaque matter an oblique ray
-    may see what no light reaches along an axis, so else only the voxel in front dims the light.
+    Columns are weighted by the light that reaches them in a voxel. If `all_light` is true,
+    everything in front of the voxel dims this light, so that a row of voxels transmits what its
+    columns do: this suits translucent matter, which looks much the same to an oblique ray. If it is
+    false, only the voxel in front does: this suits opaque matter, of which an oblique ray may see
+    what no light reaches along an axis.
     """
     done, total = 0, 3 * math.prod(field.shape)
     numbers = out[0].shape[-1] // len(DIRECTIONS) if out else 0

@@ -54,8 +54,8 @@ from .coarse_colors import (
 from .shader import Sampling, Shader, check_width
 from .transfer_function import TransferFunction
 
-#: Results of `finer`. The finest voxels are not filtered: the sharper their detail, the smaller
-#: the pixels must be that are drawn from them, and the smaller this factor.
+#: Results of `finer`: how many times finer than for other shaders levels are chosen. Fitted: the
+#: finest voxels are not filtered, so the sharper their detail, the farther away they must be left.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE_ALPHA = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data
@@ -77,9 +77,10 @@ def _check_filterable(owner: Any, name: str, value: Any) -> TransferFunction | L
 
 
 class Filtered(Shader):
-    """The transfer function for the finest bricks, and for coarse bricks a channel of colours that
-    it makes of the finest voxels below them. Near by it draws what the transfer function does; from
-    afar, about what many rays per pixel would. `Filtered.of` makes both shader and channel.
+    """Shades the finest bricks with the transfer function, and coarse bricks with a channel of
+    colours that were computed from the finest voxels below them. Near by it draws what the transfer
+    function does; from afar, about what many rays per pixel would. `Filtered.of` makes both shader
+    and channel.
 
     Given a `Lit`, coarse bricks also store the normals' moments, and highlights widen with
     distance. Light and material may be edited at any time.
@@ -311,8 +312,8 @@ class Filtered(Shader):
             yield self.kept(colors, width).cpu()
 
     def kept(self, colors: Tensor, width: int) -> Tensor:
-        """Converts what `write` wrote to a channel: without light, averaged if `width` is that of
-        one direction.
+        """Converts what `write` wrote to a channel of `width` numbers a voxel: drops the share of
+        light, and averages the six directions if the channel stores one.
         """
         directional = without_light(colors)
         return directional if directional.shape[-1] == width else mean_of_directions(directional)

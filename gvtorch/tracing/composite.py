@@ -130,8 +130,9 @@ def scatter_hits(rays: Rays, index: Tensor, hits: Hits) -> Hits:
 
 
 def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | None = None) -> Hits:
-    """Traces pieces of the same rays, nearest first, with the result of tracing each ray at once: a
-    ray that has ended takes no more samples, and its depth is found in the piece that contains it.
+    """Traces pieces of the same rays, nearest first. The result is that of tracing each ray in one
+    pass: a ray that has ended takes no more samples, and its depth is found in the piece that
+    contains it.
     `cap` traces the cap in front of each piece.
     """
 

@@ -118,6 +118,9 @@ def cost(
         progress: Receives the number of finished rows.
         **options: Fields of `RenderOptions`.
 
+    Returns:
+        What each pixel's ray did.
+
     Raises:
         ValueError: See `render`.
     """

@@ -156,7 +156,7 @@ class Lighted:
     lights: Sequence[Light]  # in world units
     material: ShadeParameters  # how matter reflects light
     voxel: float  # world size of the finest voxel's largest side
-    cone_scale: float  # factor by which the tracers widen cones
+    cone_scale: float  # as in `RenderOptions`
     lens: ThinLens | None = None  # depth of field of the eye's rays, in world units
 
     def __call__(self, rays: Rays) -> Hits:

@@ -25,7 +25,7 @@ from .composite import TraceRays, trace_pieces
 #: Width of the cone over the diameter of the circle of confusion. Voxels half as wide as the
 #: circle, read trilinearly, blur as much as it does (variance v^2 / 4; the circle's is 1 / 16).
 #: Fitted, and below 1 / 2: the pixel's cone is added, and blurred density makes opaque things grow.
-_CONE_OF_DISC = 0.3
+_CONE_OF_LENS = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,9 +36,9 @@ class ThinLens:
     along rays, so that a sphere around the eye is sharp, with every camera model.
     """
 
-    aperture: float  # diameter of the lens
-    focus: float  # distance at which things are sharp
-    frame: Coordinates | str = Coordinates.WORLD  # or largest sides of the scene's box
+    aperture: float  # diameter of the lens, in the unit of `frame`
+    focus: float  # distance at which things are sharp, in the unit of `frame`
+    frame: Coordinates | str = Coordinates.WORLD  # or "box": largest sides of the scene's box
 
     def __post_init__(self) -> None:
         vars(self).update(
@@ -56,7 +56,7 @@ class ThinLens:
 
     def cone(self, t: Tensor) -> Tensor:
         """Returns the width of the lens's cone at distances t, for a lens in world units."""
-        return _CONE_OF_DISC * self.aperture / self.focus * (t - self.focus).abs()
+        return _CONE_OF_LENS * self.aperture / self.focus * (t - self.focus).abs()
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class ThroughLens:
         """Returns the pieces of rays before the focus (`side` -1) or behind it (1)."""
         cone, (first, last) = rays.cone.to(torch.float64), rays.range.to(torch.float64).unbind(1)
         focus = self.lens.focus
-        lens_width = _CONE_OF_DISC * self.lens.aperture / self.cone_scale  # its cone at the eye
+        lens_width = _CONE_OF_LENS * self.lens.aperture / self.cone_scale  # its cone at the eye
         width, growth = cone[:, 0] - side * lens_width, cone[:, 1] + side * lens_width / focus
         if side < 0:
             last = last.clamp(max=focus)

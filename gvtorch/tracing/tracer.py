@@ -274,7 +274,7 @@ class Batch:
 
 
 def march(
-    tracer: Tracer,  # a frame; its shader's table only decides what is hidden
+    tracer: Tracer,  # its tree and arguments; its shader's table only decides what is hidden
     rays: Rays,
     shade: Callable[[Batch], tuple[Tensor, Tensor]],  # features (k, c) and alpha (k,) of samples
     features: int,  # their number c

@@ -53,9 +53,6 @@ KINDS: dict[str, type] = {
 }
 #: Reads arguments of constructors that are stored under another name, or in another form.
 _ARGUMENT_READERS: dict[tuple[str, str], Any] = {
-    ("Isosurface", "color_channel"): lambda shader: shader.other,
-    ("Isosurface", "color_component"): lambda shader: shader.other_component,
-    ("DistanceField", "offset"): lambda shader: shader.value,
     ("Features", "channel"): lambda shader: shader.other,
     ("Gradient", "top"): lambda gradient: gradient.ends[0],
     ("Gradient", "bottom"): lambda gradient: gradient.ends[1],

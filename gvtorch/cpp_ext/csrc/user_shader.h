@@ -141,8 +141,7 @@ struct CalledShader : Kind<T> {
   }
 
  private:
-  __attribute__((noinline)) void add_lane(int lane, const Piece<Floats>& pieces, const Probe<T>& probe,
-                                          UserSums<Sum>& sums) const {
+  GV_CALL void add_lane(int lane, const Piece<Floats>& pieces, const Probe<T>& probe, UserSums<Sum>& sums) const {
     auto piece = take_lane<Piece<float>>(pieces, lane);
     if constexpr (Base::kEnds) {
       piece.front = pieces.front[lane];

@@ -23,6 +23,7 @@ from .tree import ChannelBricks
 #: Factors from one octave of scattering to the next, of its light and of its directedness; fitted
 #: to path traced clouds (benchmarks/cloud_light.py).
 OCTAVE_LIGHT, OCTAVE_DIRECTION = 0.55, 0.6
+_MAX_OCTAVES = 16
 
 
 @dataclass
@@ -40,6 +41,11 @@ class Light:
     def scatters(self) -> bool:
         """Whether matter is a scattering medium, which has no normals."""
         return bool(self.parameters.octaves > 0)
+
+    @property
+    def octaves(self) -> int:
+        """How many octaves of scattering are summed."""
+        return int(min(max(0.0, float(self.parameters.octaves)), _MAX_OCTAVES))
 
     def normal_at(self, probe: Probe, t: Tensor) -> Tensor:
         """Returns (r, 3) normals towards the eye, stored or the gradient's; 0 where none exists."""
@@ -167,7 +173,7 @@ class Light:
         """
         p, weight, total = self.parameters, base, torch.zeros_like(base)
         g = torch.zeros_like(cosine) + p.anisotropy
-        for _ in range(int(p.octaves)):
+        for _ in range(self.octaves):
             total = total + weight * (phase(g, cosine) * clear)[:, None]
             weight = weight * (base * base) * OCTAVE_LIGHT
             g = g * OCTAVE_DIRECTION
@@ -177,7 +183,7 @@ class Light:
 
     def faintest(self, stop_clear: Tensor) -> Tensor:
         """Returns the transmittance at which shadow cones end: the last octave uses its root."""
-        for _ in range(1, int(self.parameters.octaves)):
+        for _ in range(1, self.octaves):
             stop_clear = stop_clear * stop_clear
         return stop_clear
 
@@ -193,7 +199,8 @@ class Shadows:
     """Traces cones from samples to the light, and counts their samples and misses."""
 
     def __init__(self, walk: Walk, cube: Tensor, cone_scale: float) -> None:
-        self.walk, self.cube, self.cone_scale = walk, cube, cone_scale  # the eye's; see `Light`
+        # The walk of the eye's rays; world size of the root cube (3,); factor of all cones.
+        self.walk, self.cube, self.cone_scale = walk, cube, cone_scale
         self.samples, self.missed = torch.zeros_like(walk.samples), torch.zeros_like(walk.missed)
 
     def light_share(

@@ -176,7 +176,7 @@ class Transfer:
     def __init__(self, args: TraceArguments) -> None:
         self.table_lm4, self.domain_2, self.opaque_m = args.table_lm4, args.domain_2, args.opaque_m
         self.low: Tensor | float
-        self.scale: Tensor | float  # rows a value
+        self.scale: Tensor | float  # table rows per unit of the value
         self.low, high = self.domain_2.unbind(0)
         self.scale = divide(len(self.opaque_m) - 1, high - self.low, high)
 

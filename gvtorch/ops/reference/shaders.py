@@ -131,13 +131,13 @@ class Isosurface(Lit):
 
     def color_at(self, probe: Probe, t: Tensor) -> Tensor:
         """Returns (r, 3) base colours of the surface at distances t (r,)."""
-        if self.numbers.scale > 0:
-            assert self.other is not None  # a scale is given with its channel
-            rgba = probe.numbers(self.other, t)[:, :4] * self.numbers.scale
+        other = self.other
+        if self.numbers.scale > 0 and other is not None and other.constant_nc.shape[1] >= 4:
+            rgba = probe.numbers(other, t)[:, :4] * self.numbers.scale
             has_opacity = (rgba[:, 3:] > 0) & (self.numbers.premultiplied > 0)
             return rgba[:, :3] / torch.where(has_opacity, rgba[:, 3:], 1.0)
-        if self.other is not None:
-            return self.transfer.look_up(probe.number(self.other, t))[:, :3]
+        if other is not None:
+            return self.transfer.look_up(probe.number(other, t))[:, :3]
         return self.transfer.look_up(self.level.expand_as(t))[:, :3]
 
 

@@ -4,8 +4,8 @@
 //
 // `kind` is one of the types below: it defines the argument's type in the op's schema, what torch passes, the dtype of
 // a tensor, and what kernels get. `limit` keeps memory safe: how many numbers a tensor holds, or what an int is below
-// (it is never negative); kAny where that is checked elsewhere. It is an expression of sizes that the function that
-// expands the list has stored in `args`, the kernels' struct, or named. An X makes one thing of each line:
+// (it is never negative); kAny where that is checked elsewhere. It may use the sizes in `args`, the kernels' struct,
+// and the local variables that the line above the list names. An X makes one thing of each line:
 //
 //   GV_VIEW    a member of the struct that kernels read; GV_TYPED_VIEW, of a struct template of the real type T
 //   GV_FIELD   a member of the struct that torch fills (in entry.h, like those below)
@@ -95,7 +95,7 @@ using Bool = NumberOf<bool>;
   X(Voxels, bricks_bzyxc, kAny)       \
   X(Voxels, constant_tnc, args.nodes* args.voxel_width)
 
-// Node pool, transfer function, and where rays end. Sizes in limits: tiles, rows
+// Node pool, transfer function, and where rays end. The limits use tiles, rows
 #define GV_WALK(X)                                         \
   X(Voxels, range_tn2c, 2 * args.nodes * args.voxel_width) \
   X(Int, component, args.voxel_width)                      \
@@ -135,7 +135,7 @@ struct TraceArgs {
   void *color_r3, *alpha_r1, *depth_r1;
   int32_t* samples_r;
   bool* missed_r;
-  uint8_t* hidden_tn;  // scratch, see allocate_node_cache
+  uint8_t* hidden_tn;  // scratch, see trace_chunks.h
 
   int64_t rays, bricks, nodes;
   int64_t packet_bricks;  // how many of the bricks, from the first on, packets read; see trace_chunks.h
@@ -143,7 +143,7 @@ struct TraceArgs {
   VoxelType voxel;
   int32_t nodes_per_tile, side;
   int32_t voxel_width;    // numbers per voxel
-  int32_t rows, lengths;  // of the table: of the transfer function, for each length of interval
+  int32_t rows, lengths;  // table_lm4 has a table of `rows` rows for each of `lengths` lengths of intervals
 };
 
 enum class LightKind { kHeadlight, kDirectional, kPoint };

@@ -178,8 +178,8 @@ GV_HD MaskOf<T> all_lanes() {
 template <class T>
 constexpr bool kPacket = LanesOf<T>::kPacket;
 
-// Defines a struct's `each_member`, which calls body(a's member, b's member) for each member that differs between
-// lanes. `calls`: GV_BOTH(member) of each, and each_member(a, b, body) of its base.
+// Defines a struct's `each_member`, which calls body(a's member, b's member) for each member that a lane's
+// copy needs. `calls`: GV_BOTH(member) of each, and each_member(a, b, body) of its base.
 #define GV_BOTH(member) body(a.member, b.member);
 #define GV_EACH_MEMBER(calls)                                   \
   template <class A, class B, class Body>                       \

@@ -113,7 +113,8 @@ GV_HD void add_to(T* sum, T value) {
     atomicAdd(sum, value);
   }
 #else
-  T expected = *sum;
+  T expected;
+  __atomic_load(sum, &expected, __ATOMIC_RELAXED);
   T desired = expected + value;
   while (!__atomic_compare_exchange(sum, &expected, &desired, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
     desired = expected + value;

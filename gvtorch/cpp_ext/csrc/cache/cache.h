@@ -4,9 +4,9 @@
 //
 // Equal to the twins in ops/cache.py in every integer. What each device defines (cpu.cpp, cuda.cu):
 //   compact(n, list)   list.flags(index) returns which of kListed, kCounted and kTouched each index is
-//                      list.process(index, flags, rank, listed)  is called for every touched index; listed and counted
-//                                                                ones are touched. rank: listed ones before it;
-//                                                                listed: all
+//                      list.process(index, flags, rank, listed)  is called for every touched index, as listed and
+//                                                                counted ones are. rank: how many listed indices
+//                                                                precede it; listed: how many there are
 //                      list.clear_entry(rank)                    is called for every unused one of list.entries()
 //                      list.store_totals(listed, counted)        is called once
 //   sort_keys(keys, n) sorts n numbers in ascending order
@@ -259,7 +259,7 @@ struct TakeFromOwner : UnlinkArgs {
     owner_s[slot] = kAbsent;
     if (!shared_s[slot]) return;
     leaving_s[slot] = 1;
-    *any_shared = 1;
+    store_stamp(any_shared, 1);
   }
 };
 

@@ -11,7 +11,7 @@ namespace gvtorch {
 
 enum class NoiseKind : int32_t { kPerlin, kValue, kSimplex, kNearest, kSecond, kApart, kCount };
 
-// Sizes in limits: points. Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise.
+// The limits use points. Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise.
 #define GV_NOISE(X)                     \
   X(Reals, point_pn, args.axes* points) \
   X(Int, kind, kNoiseKinds)             \

@@ -16,6 +16,13 @@ struct PacketBrick {
   // True where the brick is in one of the first `count` slots; only if `brick` holds slots.
   GV_HD Mask in_first_slots(int32_t count) const { return stored & (brick < count); }
 
+  // Lanes of `mask`, which no longer use the brick, read the pool's first voxels.
+  GV_HD void forget(Mask mask) {
+    brick = select(mask, Ints{}, brick);
+    offset = choose(mask, Vec3<Floats>{}, offset);
+    slope = choose(mask, Vec3<Floats>{}, slope);
+  }
+
   GV_HD Vec3<Floats> at(Floats t) const {
     return {offset.x + t * slope.x, offset.y + t * slope.y, offset.z + t * slope.z};
   }

@@ -70,12 +70,11 @@ struct PacketPath {
     put_ray(lane, beam, {take_lane<Sight<float>>(from.sight, from_lane).at(cone.t), cone.direction}, beam_intervals);
   }
 
-  // What lanes see in the nodes that they have come to.
+  // What `find` returns: the lanes whose node shows something, for which `fine`, `coarse` and the fields beside them
+  // are set; those of them whose node has one value; those whose node shows nothing; and those that want data that is
+  // missing and was requested.
   struct Found {
-    Mask shown;    // something: `fine`, `coarse` and the fields beside them are set
-    Mask uniform;  // of these, one value
-    Mask nothing;  // nothing
-    Mask lacking;  // data that they want is missing and was requested
+    Mask shown, uniform, nothing, lacking;
   };
   // The same as Walk::find, for shaders that hide a node from all rays or from none.
   GV_CALL Found find(Mask mask, bool sees_empty) {
@@ -248,6 +247,7 @@ struct PacketPath {
       going = going & ~(active & ((level == wanted) | (tile < 0) | hidden_nodes));
     }
     path_depth = mask ? depth : path_depth;
+    depth = larger(depth, Ints{});  // an index, also in lanes outside `mask`
   }
 
   // `move_to` moves lanes to their positions at distance t; it returns the deepest level, at most `deepest`, at which a

@@ -15,8 +15,8 @@ struct PacketShadows {
 
   const Light<float>& light;
   const Shader shader;
-  PacketWalk<Kernel, Values, Shader> walk;  // of cones; it keeps the paths of the last ones
-  int32_t points = 0;                       // how many wait
+  PacketWalk<Kernel, Values, Shader> tracer;  // of cones; it keeps the paths of the last ones
+  int32_t points = 0;                         // how many wait
   LitPoint<Floats> point[kPoints / kLanes];
   float weight[kPoints], share[kPoints];  // weight: share of the picture; share: of the light, see Light::in_shadow
   int32_t ray_lane[kPoints];
@@ -27,27 +27,32 @@ struct PacketShadows {
   PacketShadows(const Kernel& kernel, const Values& values, const ShadeArgs& args)
       : light(kernel.light),
         shader{{}, kernel.shader},
-        walk(kernel, shader, values, args, kernel.light.faintest(kernel.stop_clear)) {}
+        tracer(kernel, shader, values, args, kernel.light.faintest(kernel.stop_clear)) {}
 
+  // True if `put` may find no room.
+  GV_HD bool is_full() const { return points > kPoints - kLanes; }
   // Puts an interval of each lane of `mask`.
   GV_HD void put(Mask mask, const LitPoint<Floats>& lit_point, const LightCone<Floats>& to_light, Packet& packet) {
-    if (points > kPoints - kLanes) add_all(packet);
-    const Mask receives = light.receives(lit_point);
+    if (is_full()) add_all(packet);
     const Floats weights = packet.sum.clear * lit_point.base.alpha;
     for_lanes(mask, [&](int lane) {
-      put_lane(point[points / kLanes], points % kLanes, take_lane<LitPoint<float>>(lit_point, lane));
-      weight[points] = weights[lane];
-      share[points] = 1;
-      ray_lane[points] = lane;
-      if (receives[lane]) {
-        cone[cones] = take_lane<LightCone<float>>(to_light, lane);
-        cone_point[cones++] = points;
-      }
-      ++points;
+      put(lane, take_lane<LitPoint<float>>(lit_point, lane), take_lane<LightCone<float>>(to_light, lane),
+          weights[lane]);
     });
   }
+  GV_HD void put(int lane, const LitPoint<float>& lit_point, const LightCone<float>& to_light, float lane_weight) {
+    put_lane(point[points / kLanes], points % kLanes, lit_point);
+    weight[points] = lane_weight;
+    share[points] = 1;
+    ray_lane[points] = lane;
+    if (light.receives(lit_point)) {
+      cone[cones] = to_light;
+      cone_point[cones++] = points;
+    }
+    ++points;
+  }
   // Adds all that wait.
-  __attribute__((noinline)) void add_all(Packet& packet) {
+  GV_CALL void add_all(Packet& packet) {
     trace(packet);
     for (int32_t first = 0; first < points; first += kLanes) {
       Floats shares;
@@ -59,30 +64,21 @@ struct PacketShadows {
     }
     points = 0;
   }
-  // The share of the light that a cone of a lane lets through, while nothing waits.
-  GV_HD float share_of(int lane, const LightCone<float>& lane_cone, Packet& packet) {
-    ray_lane[0] = lane;
-    cone[0] = lane_cone;
-    cone_point[0] = 0;
-    cones = 1;
-    trace(packet);
-    return share[0];
-  }
 
  private:
-  __attribute__((noinline)) void trace(Packet& packet) {
+  GV_CALL void trace(Packet& packet) {
     const auto begin_lane = [&](int lane, int64_t number) {
-      walk.begin_cone(lane, cone[number], packet, ray_lane[cone_point[number]]);
-      put_lane(walk.sum, lane, typename Shader::Sum{1, false, walk.stop_clear});
+      tracer.begin_cone(lane, cone[number], packet, ray_lane[cone_point[number]]);
+      put_lane(tracer.sum, lane, typename Shader::Sum());
       return number;
     };
     const auto end_lane = [&](int lane) {
-      const int32_t number = cone_point[walk.numbers[lane]];
-      share[number] = walk.sum.clear[lane];
-      packet.samples[ray_lane[number]] += walk.samples[lane];
-      packet.sum.missed[ray_lane[number]] |= walk.sum.missed[lane];
+      const int32_t number = cone_point[tracer.items[lane]];
+      share[number] = tracer.sum.clear[lane];
+      packet.samples[ray_lane[number]] += tracer.samples[lane];
+      packet.sum.missed[ray_lane[number]] |= tracer.sum.missed[lane];
     };
-    walk.follow(0, cones, begin_lane, end_lane);
+    tracer.follow(0, cones, begin_lane, end_lane);
     cones = 0;
   }
 };

@@ -53,7 +53,7 @@ struct PacketWalk : PacketPath {
   const int64_t packet_bricks;
   const float stop_clear;
 
-  int64_t numbers[kLanes];  // of the rays, or of the cones to the light, in the lanes; -1: none
+  int64_t items[kLanes];  // of the rays, or of the cones to the light, in the lanes; -1: none
   Mask alive{};
   typename Shader::template SumOf<Floats> sum;
   Ints samples{};
@@ -84,26 +84,22 @@ struct PacketWalk : PacketPath {
       const int64_t ray_number = walk.order(position);
       if (ray_number < 0) return ray_number;
       begin_ray(lane, ray_number);
-      Sum lane_sum;
-      float* const feature_c = kernel.features_rc + ray_number * kernel.features;
-      for (int32_t c = 0; c < kernel.features; ++c) feature_c[c] = 0;
-      lane_sum.begin(0, static_cast<float>(walk.rays.clear(ray_number)), kernel.hit_clear, feature_c);
-      put_lane(sum, lane, lane_sum);
+      put_lane(sum, lane, kernel.first_sum(ray_number));
       return ray_number;
     };
     follow(begin, end, begin_lane, [&](int lane) { end_ray(lane); });
   }
 
   // Follows items, numbers `next` to end - 1, to their ends, kLanes at a time. begin_lane(lane, item) begins an item in
-  // a lane and returns what `numbers` is to hold there: -1 where there is nothing to follow, and the lane takes the
+  // a lane and returns what `items` is to hold there: -1 where there is nothing to follow, and the lane takes the
   // next item. end_lane(lane) is called for all others at the end.
   template <class Begin, class End>
   GV_HD void follow(int64_t next, int64_t end, const Begin& begin_lane, const End& end_lane) {
     while (next < end) {
       for (int lane = 0; lane < kLanes; ++lane) {
-        numbers[lane] = -1;
-        while (numbers[lane] < 0 && next < end) numbers[lane] = begin_lane(lane, next++);
-        set_lane(alive, lane, numbers[lane] >= 0);
+        items[lane] = -1;
+        while (items[lane] < 0 && next < end) items[lane] = begin_lane(lane, next++);
+        set_lane(alive, lane, items[lane] >= 0);
       }
       alive = alive & intervals.inside() & (sum.clear > stop_clear);
       remaining = samples = Ints{};
@@ -117,7 +113,7 @@ struct PacketWalk : PacketPath {
       }
       if constexpr (kShadowed) shadows.add_all(*this);
       for (int lane = 0; lane < kLanes; ++lane) {
-        if (numbers[lane] >= 0) end_lane(lane);
+        if (items[lane] >= 0) end_lane(lane);
       }
     }
   }
@@ -189,7 +185,7 @@ struct PacketWalk : PacketPath {
     auto&& lane_sum = sum_of<Sum>(sum, lane);
     if constexpr (Shader::kSurface) {
       if (lane_sum.depth < INFINITY) {
-        const Ray<float> lane_ray(walk.rays, numbers[lane]);
+        const Ray<float> lane_ray(walk.rays, items[lane]);
         const Sight<float> lane_sight = take_lane<Sight<float>>(sight, lane);
         if (walk.rays.deep) {
           kernel.template surface<Digits<float>>(lane_ray, lane_sight, lane_sum);
@@ -198,7 +194,7 @@ struct PacketWalk : PacketPath {
         }
       }
     }
-    kernel.finish(numbers[lane], ray.moved[lane], samples[lane], lane_sum);
+    kernel.finish(items[lane], ray.moved[lane], samples[lane], lane_sum);
   }
 
   // For lanes whose run has ended: begins the next one in the same node, or visits the next node.
@@ -250,8 +246,8 @@ struct PacketWalk : PacketPath {
     const Mask marches_alone = mask & (intervals.cut() | beyond);
     if (any(marches_alone)) {
       march_alone(marches_alone);
-      fine.brick = marches_alone ? Ints{} : fine.brick;  // reads that lanes ignore must stay in the pool too
-      coarse.brick = marches_alone ? Ints{} : coarse.brick;
+      fine.forget(marches_alone);  // reads that lanes ignore must stay in the pool too
+      coarse.forget(marches_alone);
       mask = mask & ~marches_alone;
     }
     remaining = mask ? intervals.run(mask, extent) : remaining;
@@ -301,10 +297,9 @@ struct PacketWalk : PacketPath {
 
   GV_HD void add(Mask mask, const Piece<Floats>& piece) {
     if constexpr (kShadowed) {
-      const auto add_lit = [&](Mask shown, const LitPoint<Floats>& point, const LightCone<Floats>& cone,
-                               const Piece<Floats>& lit_piece) {
+      const auto add_lit = [&](Mask shown, const LitPoint<Floats>& point, const LightCone<Floats>& cone) {
         shadows.put(shown, point, cone, *this);
-        sum.absorb(point.base.alpha, lit_piece, shown);
+        sum.absorb(point.base.alpha, piece, shown);
       };
       shader.add(mask, piece, *this, sum, add_lit);
     } else {
@@ -312,21 +307,25 @@ struct PacketWalk : PacketPath {
     }
   }
 
-  __attribute__((noinline)) void march_alone(Mask mask) {
-    if constexpr (kShadowed) shadows.add_all(*this);
+  GV_CALL void march_alone(Mask mask) {
     each_lane(mask, [&](int lane, const RayProbe& probe) {
       auto lane_intervals = take_lane<Intervals<float>>(intervals, lane);
       const Extent<float> lane_extent{extent.exit[lane], extent.cone_low[lane], extent.cone_high[lane]};
       auto&& lane_sum = sum_of<Sum>(sum, lane);
-      const auto shadow = [&](const auto&, const LightCone<float>& cone, int32_t&) {
+      const auto add_lit = [&](const auto&, const Piece<float>& piece, const LitPoint<float>& point,
+                               const LightCone<float>& cone, int32_t&) {
         if constexpr (kShadowed) {
-          const float share = shadows.share_of(lane, cone, *this);
-          lane_sum.missed = lane_sum.missed || sum.missed[lane] != 0;
-          return share;
+          if (shadows.is_full()) {  // adding changes this lane's sum too
+            put_lane(sum, lane, lane_sum);
+            shadows.add_all(*this);
+            lane_sum = sum_of<Sum>(sum, lane);
+          }
+          shadows.put(lane, point, cone, lane_sum.clear * point.base.alpha);
+          lane_sum.absorb(point.base.alpha, piece);
         }
       };
-      typename Kernel::template Visitor<Shader, std::decay_t<decltype(shadow)>> visitor{kernel, shader, nullptr,
-                                                                                        lane_sum, shadow};
+      typename Kernel::template Visitor<Shader, std::decay_t<decltype(add_lit)>> visitor{kernel,   shader,     nullptr,
+                                                                                         lane_sum, stop_clear, add_lit};
       kernel.march(lane_extent, lane_intervals, visitor, probe);
       put_lane(sum, lane, lane_sum);
       put_lane(intervals, lane, lane_intervals);

@@ -10,14 +10,14 @@
 
 namespace gvtorch {
 
-// Packets load 4 bytes at once, beyond a voxel that has fewer, but not beyond the pool; and they count the numbers of a
-// brick in floats. What they can't read so, the functions of a single ray read: the last brick of such voxels, and
-// bricks of more than 2^24 numbers. A pool of a single brick is copied to memory with room after it if that takes
-// little time beside its rays.
+// Packets load 4 bytes at once, beyond a voxel that has fewer, but not beyond the pool; and they compute offsets in a
+// brick in float32, which is exact up to 2^24. What they can't read so, the functions of a single ray read: the last
+// brick of such voxels, and bricks of more than 2^24 numbers. A pool of a single brick is copied to memory with room
+// after it if that takes little time beside its rays.
 //
 // Sets args.packet_bricks, and pointers to the copies, which `copies` owns.
 inline void prepare_pools(const torch::stable::Tensor& like, ShadeArgs& args, torch::stable::Tensor (&copies)[3]) {
-  constexpr int64_t kMaxNumbers = 1 << 24, kBytesPerRay = 256;
+  constexpr int64_t kMaxBrickNumbers = 1 << 24, kBytesPerRay = 256;
   constexpr int32_t kSmallSide = 8;  // always copied: idle lanes load at the first eight voxels, and it may end there
   struct Channel {
     const void*& bricks;
@@ -36,7 +36,7 @@ inline void prepare_pools(const torch::stable::Tensor& like, ShadeArgs& args, to
     numbers = std::max(numbers, voxels * channel.width);
     narrow = narrow || (channel.width > 0 && brick_bytes(channel.type, 1, 1) < 4);
   }
-  const bool counted = numbers <= kMaxNumbers;
+  const bool counted = numbers <= kMaxBrickNumbers;
   const bool copied = args.bricks == 0 || (args.bricks == 1 && narrow && counted &&
                                            (args.side <= kSmallSide || bytes <= kBytesPerRay * args.rays));
   args.packet_bricks = !counted ? 0 : copied ? 1 : args.bricks - (narrow ? 1 : 0);

@@ -39,6 +39,7 @@ GV_HD const Numbers& own_numbers(const Parameters<T>* parameters) {
 // Factors of an octave of scattering over the one before it: of its light, and of its anisotropy. Fitted to path traced
 // clouds (benchmarks/cloud_light.py).
 constexpr double kOctaveLight = 0.55, kOctaveDirection = 0.6;
+constexpr int kMaxOctaves = 16;
 
 // The moments of normals that no light reaches are stored divided by this: see shaders/coarse_colors.py.
 constexpr double kFaint = 32;
@@ -88,6 +89,9 @@ struct Light {
 
   // True for a scattering medium, which has no normals.
   GV_HD bool scatters() const { return parameters->octaves > 0; }
+  GV_HD int32_t octaves() const {
+    return static_cast<int32_t>(clamp(parameters->octaves, static_cast<T>(0), static_cast<T>(kMaxOctaves)));
+  }
 
   GV_HD LightKind kind() const { return static_cast<LightKind>(static_cast<int32_t>(parameters->light_kind)); }
 
@@ -167,7 +171,7 @@ struct Light {
     if (scatters() && kind() != LightKind::kHeadlight) return scattered(point.base, point.cosine, share);
     return lit(point.base, point.facing * share, point.highlight * share);
   }
-  // Adds an interval, lit; with shadows, `shadow(mask, point, cone, piece)` adds it, by `in_shadow`.
+  // Adds an interval, lit; with shadows, `shadow(mask, point, cone)` adds it, by `in_shadow`.
   template <class V, class AnyProbe, class... Shadow>
   GV_HD void add(MaskOf<V> mask, const Row<V>& base, const AnyProbe& probe, const Piece<V>& piece, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
@@ -176,7 +180,7 @@ struct Light {
     const LitPoint<V> point = point_of(base, n, probe.sight.direction, cone.direction);
     sum.add_normal(n, sum.clear * base.alpha, mask);
     if constexpr (sizeof...(shadow) > 0) {
-      (shadow(mask, point, cone, piece), ...);
+      (shadow(mask, point, cone), ...);
     } else {
       sum.add(lit(base, point.facing, point.highlight), piece, mask);
     }
@@ -248,7 +252,8 @@ struct Light {
     const V albedo[3] = {base.red, base.green, base.blue};
     V weight[3] = {albedo[0], albedo[1], albedo[2]}, sum[3] = {};
     T g = p.anisotropy;
-    for (T octave = 0; octave < p.octaves; octave = octave + 1) {
+    GV_NO_UNROLL
+    for (int32_t octave = octaves(); octave > 0; --octave) {
       const V share = phase(g, cosine) * clear;
       for (int i = 0; i < 3; ++i) {
         sum[i] = sum[i] + weight[i] * share;
@@ -269,7 +274,8 @@ struct Light {
   }
   // The transmittance at which rays to the light end: so small because the last octave uses a root of it.
   GV_HD T faintest(T stop_clear) const {
-    for (T octave = 1; octave < parameters->octaves; octave = octave + 1) stop_clear = stop_clear * stop_clear;
+    GV_NO_UNROLL
+    for (int32_t octave = octaves(); octave > 1; --octave) stop_clear = stop_clear * stop_clear;
     return stop_clear;
   }
 };

@@ -26,10 +26,10 @@ struct ChannelView {
   int32_t width;  // numbers per voxel
 
   GV_HD bool exists() const { return constant_tnc != nullptr; }
-  // A number of a node without a brick.
+  // A number of a node without a brick; 0 where there is no node.
   template <class T>
   GV_HD T constant(int32_t node, int32_t component) const {
-    return read_number<T>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
+    return node < 0 ? T{} : read_number<T>(constant_tnc, type, static_cast<int64_t>(node) * width + component);
   }
 };
 

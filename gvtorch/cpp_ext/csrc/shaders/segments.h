@@ -13,14 +13,14 @@
 
 namespace gvtorch {
 
-// A part of a walk: it continues from state_r3, and pauses after `limit` samples. Sizes in limits: rays
+// A part of a walk: it continues from state_r3, and pauses after `limit` samples. The limits use rays
 #define GV_PART(X)                  \
   X(MaybeReals, state_r3, 3 * rays) \
   X(Int, limit, kAny)               \
   X(Bool, by_node, kAny)
 #define GV_SEGMENT_RANGE(X) X(Longs, first_r, rays) X(Count, total, kAny)
 
-// Segments, and samples of them. Sizes in limits: samples
+// Segments, and samples of them. The limits use samples
 #define GV_SAMPLES(X)                      \
   X(Words, ray_s, args.segments)           \
   X(Words, node_s2, 2 * args.segments)     \
@@ -32,7 +32,7 @@ namespace gvtorch {
   X(Words, number_k, samples)
 #define GV_GRADIENT(X) X(Reals, grad_kc, samples* voxel_width)
 
-// Packed samples of rays: those of a ray are consecutive, from front to back. Sizes in limits: rays
+// Packed samples of rays: those of a ray are consecutive, from front to back. The limits use rays
 #define GV_PACKED(X)                           \
   X(Reals, alpha_k, args.count)                \
   X(Reals, feature_kc, args.count* args.width) \

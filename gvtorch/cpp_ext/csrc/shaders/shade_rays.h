@@ -62,14 +62,15 @@ struct ShadeRay : Walk<T> {
     const Ray<T> ray(this->rays, number);
     const Sight<T> sight(this->rays, number, ray.moved);
     Intervals<T> intervals(ray, step, lengths);
-    Sum sum;
-    sum.begin(0, static_cast<T>(this->rays.clear(number)), this->hit_clear, features_rc + number * features);
-    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
+    Sum sum = first_sum(number);
     const auto& ready = ready_for_ray(shader);
-    const auto shadow = [&](const auto& probe, const LightCone<T>& cone, int32_t& samples) {
-      return share_of_light(ray, probe, cone, samples, sum.missed);
+    const auto add_lit = [&](const auto& probe, const Piece<T>& piece, const LitPoint<T>& point,
+                             const LightCone<T>& cone, int32_t& samples) {
+      const T share = light.receives(point) ? share_of_light(ray, probe, cone, samples, sum.missed) : static_cast<T>(1);
+      sum.add(light.in_shadow(point, share), piece);
     };
-    Visitor<std::decay_t<decltype(ready)>, std::decay_t<decltype(shadow)>> visitor{*this, ready, &sight, sum, shadow};
+    Visitor<std::decay_t<decltype(ready)>, std::decay_t<decltype(add_lit)>> visitor{
+        *this, ready, &sight, sum, this->stop_clear, add_lit};
     this->template follow<Digits>(ray, intervals, visitor);
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) {
@@ -77,6 +78,16 @@ struct ShadeRay : Walk<T> {
       }
     }
     finish(number, ray.moved, visitor.samples, sum);
+  }
+
+  // The sum of a ray before its first interval.
+  GV_HD Sum first_sum(int64_t number) const {
+    Sum sum;
+    sum.clear = static_cast<T>(this->rays.clear(number));
+    sum.hit_clear = this->hit_clear;
+    sum.feature_c = features_rc + number * features;
+    for (int32_t c = 0; c < features; ++c) sum.feature_c[c] = 0;
+    return sum;
   }
 
   // Smallest and largest value of a node, over all directions.
@@ -151,9 +162,9 @@ struct ShadeRay : Walk<T> {
     return channels.normal.exists() && light.kind() == LightKind::kPoint;  // from a direction that varies
   }
 
-  // See Walk::follow. AnyShader: as above. Shadow: traces a cone to the light, see share_of_light; called only
-  // with kShadows.
-  template <class AnyShader, class Shadow = std::nullptr_t>
+  // See Walk::follow. AnyShader: as above. AddLit: adds an interval with its shadow, add_lit(probe, piece, point, cone,
+  // samples); called only with kShadows.
+  template <class AnyShader, class AddLit = std::nullptr_t>
   struct Visitor {
     static constexpr bool kSeesEmpty = AnyShader::kSeesEmpty, kEnds = AnyShader::kEnds;
     static constexpr bool kToLight = AnyShader::kToLight;
@@ -161,20 +172,21 @@ struct ShadeRay : Walk<T> {
     const AnyShader& shader;
     const Sight<T>* sight;
     typename AnyShader::Sum& sum;
-    Shadow shadow{};
+    T stop_clear;  // transmittance at which the ray ends
+    AddLit add_lit{};
     int32_t samples = 0;
 
     GV_HD bool& missed() { return sum.missed; }
-    GV_HD bool sees() const {
-      if constexpr (kToLight) return sum.clear > sum.stop_clear;
-      return sum.clear > kernel.stop_clear;
-    }
+    GV_HD bool sees() const { return sum.clear > stop_clear; }
     GV_HD bool goes_on() const { return sees(); }
     template <class Node>
     GV_HD void finish(const Node&) const {}
     GV_HD NodeWords node_words(int32_t node) const {
-      if constexpr (AnyShader::kHidesAlike) return kernel.node_words(node);
-      return kernel.tree.words_of(node, kernel.hides(shader, node, sum));
+      if constexpr (AnyShader::kHidesAlike) {
+        return kernel.node_words(node);
+      } else {
+        return kernel.tree.words_of(node, kernel.hides(shader, node, sum));
+      }
     }
     GV_HD RayProbe enter(const Ray<T>& ray, const Visit<T>& visit, const Digits& digits) const {
       return RayProbe(kernel.channels, *sight, kernel.rays, ray, visit, digits);
@@ -250,11 +262,9 @@ struct ShadeRay : Walk<T> {
     template <class ActiveShader>
     GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
       if constexpr (kShadows && !kToLight) {
-        const auto add_lit = [&](bool, const LitPoint<T>& point, const LightCone<T>& cone, const Piece<T>& piece) {
-          const T share = kernel.light.receives(point) ? shadow(probe, cone, samples) : static_cast<T>(1);
-          sum.add(kernel.light.in_shadow(point, share), piece);
-        };
-        active_shader.add(true, piece, probe, sum, add_lit);
+        active_shader.add(true, piece, probe, sum, [&](bool, const LitPoint<T>& point, const LightCone<T>& cone) {
+          add_lit(probe, piece, point, cone, samples);
+        });
       } else {
         active_shader.add(true, piece, probe, sum);
       }
@@ -275,8 +285,7 @@ struct ShadeRay : Walk<T> {
     intervals.move_to(true, intervals.count + 1);
     const ShadowShader<T, Shader> shadow_shader{{}, shader};
     typename ShadowShader<T, Shader>::Sum sum;
-    sum.stop_clear = light.faintest(this->stop_clear);
-    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &sight, sum};
+    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &sight, sum, light.faintest(this->stop_clear)};
     this->template follow<Digits>(beam, intervals, visitor);
     samples += visitor.samples;
     missed = missed || sum.missed;

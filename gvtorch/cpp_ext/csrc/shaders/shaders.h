@@ -178,19 +178,18 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
 // The shader of rays to a light (shadow rays): only the transmittance through what another shader shows.
 template <class T, class Shader>
 struct ShadowShader : ShaderFacts {
-  static constexpr bool kHidesAlike = Shader::kHidesAlike, kToLight = true;
+  static constexpr bool kToLight = true;
+  static_assert(Shader::kHidesAlike, "the same nodes are hidden from the rays to the light");
   template <class V>
   struct SumOf {
     V clear = broadcast<V>(static_cast<T>(1));  // transmittance
     MaskOf<V> missed{};
-    T stop_clear{};  // transmittance at which the ray ends
 
-    GV_EACH_MEMBER(GV_BOTH(clear) GV_BOTH(missed) GV_BOTH(stop_clear))
+    GV_EACH_MEMBER(GV_BOTH(clear) GV_BOTH(missed))
   };
   using Sum = SumOf<T>;
   const Shader& shader;
 
-  GV_HD bool hides(T low, T high, const Sum& sum) const { return shader.hides(low, high, sum); }
   template <class V, class AnyProbe>
   GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe, SumOf<V>& sum) const {
     sum.clear = select(mask, sum.clear * (1 - shader.alpha(mask, piece, probe)), sum.clear);
@@ -329,7 +328,7 @@ struct Isosurface : ShaderFacts {
   }
   GV_HD Row<T> color_at(const Probe<T>& probe, T t) const {
     const auto& color_channel = probe.channels.other;
-    if (numbers().scale > 0) {
+    if (numbers().scale > 0 && color_channel.width >= 4) {
       const Row<T> stored = probe.four_at(true, color_channel, 0, t);
       const T opacity = stored.alpha * numbers().scale;
       const T divisor = numbers().premultiplied > 0 && opacity > 0 ? opacity : 1;

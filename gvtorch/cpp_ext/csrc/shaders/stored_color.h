@@ -126,10 +126,10 @@ struct StoredColor : ShaderFacts {
   }
 };
 
-// A transfer function, `Base`, that is right at coarse levels too: a second channel, which only the first bricks of the
-// pool have, holds for each of their voxels what the function makes of the finest voxels below it. Other bricks, and
-// nodes without one, are shaded by the function as usual. Where two levels blend, what they show is blended, not their
-// values. `Shader` derives from this and has
+// Shades with stored colours where a brick has them, else with a transfer function, `Base`. The colours, a second
+// channel which only the first bricks of the pool have, were computed by the function from the finest voxels below each
+// of their voxels. Where two levels blend, what they show is blended, not their values. `Shader` derives from this and
+// has
 //
 //   contribution(mask, piece, probe, node)       what one of the nodes adds for an interval, of a type that `combined`
 //                                                accepts

@@ -236,12 +236,6 @@ struct ShadeSum {
   Real hit_clear;                          // transmittance at which depth is recorded
   typename LanesOf<T>::Pointer feature_c;  // of each lane
 
-  // Begins a new ray in a lane.
-  GV_HD void begin(int lane, Real clear, Real hit_clear, Real* feature_c) {
-    set_lane(this->clear, lane, clear);
-    this->hit_clear = hit_clear;
-    set_lane(this->feature_c, lane, feature_c);
-  }
   // Adds an interval of a colour, premultiplied or not.
   GV_HD void add(const Row<T>& row, const Piece<T>& piece, Mask mask = all_lanes<T>()) {
     add_light(row, clear * row.alpha, mask);
@@ -266,7 +260,7 @@ struct ShadeSum {
 
   // Takes the light that an interval absorbs. Depth is where in the interval the transmittance falls to hit_clear, as
   // if the interval were homogeneous.
-  GV_HD void absorb(T alpha, const Piece<T>& piece, Mask mask) {
+  GV_HD void absorb(T alpha, const Piece<T>& piece, Mask mask = all_lanes<T>()) {
     const T clear_after = clear * (1 - alpha);
     for_lanes(mask && clear_after < hit_clear && clear >= hit_clear, [&](int lane) {
       const Real fraction = hit_fraction(lane_of(clear, lane), lane_of(alpha, lane), hit_clear);

@@ -11,7 +11,7 @@
 namespace gvtorch::GV_NAMESPACE {
 
 // Whether a node is hidden. The CPU computes this when the first ray reaches a node, since most are never visited; a
-// GPU, where many threads would repeat it, does so for all nodes before the rays are traced: see NodeWords.
+// GPU, where many threads would repeat it, does so for all nodes before the rays are traced: see HideShaded.
 constexpr uint8_t kUnknown = 0, kShown = 1, kHidden = 2;
 
 // Rays of a picture are traced in tiles of 8 x 4 pixels, which share bricks; other rays in order.
@@ -114,9 +114,9 @@ struct Walk {
   }
 
   // True if a ray has to wait for the others of its warp (on CUDA; results do not depend on it). In each turn, every
-  // ray of a warp visits one node, and the turn lasts as long as the visit with the most intervals. Rays that cut a
-  // corner of one more node fall a turn behind, so that long and short visits share turns. A ray therefore waits while
-  // it is more than a node's side ahead of the warp's hindmost ray, which never waits.
+  // ray of a warp visits one node, and the turn lasts as long as the visit with the most intervals. Rays
+  // that do not wait would soon be in different nodes, and in each turn one long visit would delay many short ones. A
+  // ray therefore waits while it is more than a node's side ahead of the warp's hindmost ray, which never waits.
   GV_HD bool is_ahead(T start, int32_t wanted) const {
     return start - warp_minimum(start) > levels.voxel[wanted] * levels.scale[0];
   }
