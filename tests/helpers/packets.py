@@ -110,13 +110,16 @@ def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
     """Returns everything that a shader's traces write."""
     tree, results = scene(branching), []
     holes = with_holes(tree, 0.3, 5)
-    for traced_tree, size, options in (
+    pictures = [
         (tree, 21, {}),
         (tree, 5, {}),  # cones as wide as several voxels: levels blend
         (tree, 11, {"lod": "finest", "step": 1.3}),
         (tree, 11, {"stop_alpha": 0.6, "depth_alpha": 0.5}),
         (holes, 14, {}),
-    ):
+    ]
+    if getattr(shader, "shadows", False):  # the twin traces a cone from each sample, step by step
+        pictures = [(tree, 21, {"step": 1.7}), (holes, 14, {"lod": "finest", "step": 3.0})]
+    for traced_tree, size, options in pictures:
         rays = camera_rays(traced_tree, size, distance=1.5)
         cut = cut_rays(rays)
         # Most in one call: what the twin takes depends on the longest ray, not on their number.
