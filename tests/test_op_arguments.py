@@ -26,7 +26,9 @@ def tree(channels) -> gv.N3Tree:
     return gv.N3Tree.from_volume(channels, 4)
 
 
-def same_as_reference(tree, backend: str, shader: gv.Shader, index: int, value: float) -> None:
+def assert_same_as_reference(
+    tree, backend: str, shader: gv.Shader, index: int, value: float
+) -> None:
     results = []
     for name in (backend, "reference"):
         copy = copy_to(tree, DEVICES[name])
@@ -42,7 +44,7 @@ def same_as_reference(tree, backend: str, shader: gv.Shader, index: int, value: 
 @pytest.mark.parametrize("octaves", [0.5, 2.5, 40.0, 1e9, math.inf, math.nan, -1.0])
 @pytest.mark.parametrize("name", ["scattering with shadows", "colour that scatters, with shadows"])
 def test_any_number_of_octaves_ends(tree, compiled, name, octaves):
-    same_as_reference(tree, compiled, SHADERS[name], _OCTAVES, octaves)
+    assert_same_as_reference(tree, compiled, SHADERS[name], _OCTAVES, octaves)
 
 
 @pytest.mark.parametrize("channel", [None, "value", "normal"])
@@ -51,7 +53,7 @@ def test_a_surface_reads_no_colour_that_is_not_there(tree, compiled, channel):
     shader = SHADERS["isosurface"]
     if channel is not None:
         shader = gv.Isosurface(0.5, SHADER, color_channel=channel)
-    same_as_reference(tree, compiled, shader, _SCALE, 1 / 255)
+    assert_same_as_reference(tree, compiled, shader, _SCALE, 1 / 255)
 
 
 def test_a_surface_may_lie_where_no_node_is(compiled):

@@ -79,16 +79,19 @@ def seen(value, rays, light, transfer, step) -> np.ndarray:
     return np.array(out)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize(
     ("light", "branching"),
     [(SUN, 2), (LAMP, 3), (INSIDE, 2)],
     ids=["sun, N = 2", "lamp, N = 3", "lamp inside, N = 2"],
 )
-def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(backend, light, branching):
+def test_each_sample_stands_in_the_shadow_of_what_lies_before_its_light(
+    backend, light, branching, dtype
+):
     value = fog(1)
     tree = tree_of(value, backend, branching)
     rays = rays_through(box_of(value.shape, SPACING, ORIGIN), DEVICES[backend])
-    options = {"backend": backend, "lod": "finest", "dtype": torch.float64}
+    options = {"backend": backend, "lod": "finest", "dtype": dtype}
     options |= {"step": 1.0, "stop_alpha": 1.0}
     linear = gv.TransferFunction.from_points([(0, 0), (1, 0.2)], [(0, 1, 1, 1)], reference=1.0)
 

@@ -60,11 +60,11 @@ class FrameStats(RenderStats):
     """
 
     milliseconds: float = waits(0.0)  # from the first stage to the last, on CUDA the device's
-    stages: dict[str, float] = waits({})  # noqa: RUF009  milliseconds by stage
+    stages: dict[str, float] = waits({})  # milliseconds by stage
     samples: int = waits(0)  # positions at which the shader was evaluated
     tiles_used: int = waits(0)  # node tiles that rays passed through
     bricks_used: int = waits(0)  # bricks that rays sampled
-    requests: dict[str, int] = waits({})  # noqa: RUF009  by kind: load, subdivide
+    requests: dict[str, int] = waits({})  # by kind: load, subdivide
     misses: int = waits(0)  # nodes that rays missed, including pending ones
     overflow: int = waits(0)  # requested nodes that did not fit into the list
     converged: bool = waits(False)  # nothing that could be served was missing

@@ -91,7 +91,7 @@ GV_HD Sum& sum_of(UserSums<Sum>& sums, int lane) {
 }
 template <class Sum>
 GV_HD void put_lane(UserSums<Sum>& sums, int lane, const Sum& lane_sum) {
-  sums.of_lane[lane] = lane_sum;
+  if (&lane_sum != &sums.of_lane[lane]) sums.of_lane[lane] = lane_sum;
   sums.clear[lane] = lane_sum.clear;
   set_lane(sums.missed, lane, lane_sum.missed);
 }

@@ -54,7 +54,7 @@ struct PacketPath {
     const Ray<float> lane_ray(walk.rays, ray_number);
     put_ray(lane, lane_ray, {walk.rays, ray_number, lane_ray.moved}, {lane_ray, walk.step, lengths});
   }
-  // Begins a cone in a lane, see ShadeRay::share_of_light; it lies on the ray of a lane of another packet.
+  // Begins a cone in a lane, see ShadeRay::share_of_light; it begins on the ray of a lane of another packet.
   GV_CALL void begin_cone(int lane, const LightCone<float>& cone, const PacketPath& from, int from_lane) {
     const Vec3<float> origin = lane_of(from.ray.origin, from_lane), direction = lane_of(from.ray.direction, from_lane);
     Vec3<double> position;

@@ -70,12 +70,12 @@ struct LitPoint {
   GV_EACH_MEMBER(Row<V>::each_member(a.base, b.base, body); GV_BOTH(facing) GV_BOTH(highlight) GV_BOTH(cosine))
 };
 
-// A cone from distance t of a ray to the light.
+// A cone to the light. Distances are world lengths.
 template <class V>
 struct LightCone {
-  V t;
-  Vec3<V> direction;
-  V length, growth;  // distance to the light; how much the cone grows per unit of length
+  V t;                // distance along the ray at which it begins
+  Vec3<V> direction;  // world, unit length
+  V length, growth;   // distance to the light; how much the cone grows per unit of length
 
   GV_EACH_MEMBER(GV_BOTH(t) GV_BOTH(direction) GV_BOTH(length) GV_BOTH(growth))
 };
@@ -89,6 +89,7 @@ struct Light {
 
   // True for a scattering medium, which has no normals.
   GV_HD bool scatters() const { return parameters->octaves > 0; }
+  // How many octaves of scattering are summed, whatever number the parameters hold.
   GV_HD int32_t octaves() const {
     return static_cast<int32_t>(clamp(parameters->octaves, static_cast<T>(0), static_cast<T>(kMaxOctaves)));
   }
@@ -118,6 +119,7 @@ struct Light {
     for (int axis = 0; axis < 3; ++axis) n[axis] = select(faces_away, -n[axis], n[axis]);
     return n;
   }
+  // The cone to the light from distance t of the probe's ray.
   template <class AnyProbe, class V = typename AnyProbe::Number>
   GV_HD LightCone<V> cone_from(const AnyProbe& probe, typename AnyProbe::Number t) const {
     const Parameters<T>& p = *parameters;

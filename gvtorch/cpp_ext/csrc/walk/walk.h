@@ -114,9 +114,9 @@ struct Walk {
   }
 
   // True if a ray has to wait for the others of its warp (on CUDA; results do not depend on it). In each turn, every
-  // ray of a warp visits one node, and the turn lasts as long as the visit with the most intervals. Rays
-  // that do not wait would soon be in different nodes, and in each turn one long visit would delay many short ones. A
-  // ray therefore waits while it is more than a node's side ahead of the warp's hindmost ray, which never waits.
+  // ray of a warp visits one node, and the turn lasts as long as the visit with the most intervals. Rays that do not
+  // wait would soon be in different nodes, and in each turn one long visit would delay many short ones. A ray therefore
+  // waits while it is more than a node's side ahead of the warp's hindmost ray, which never waits.
   GV_HD bool is_ahead(T start, int32_t wanted) const {
     return start - warp_minimum(start) > levels.voxel[wanted] * levels.scale[0];
   }
