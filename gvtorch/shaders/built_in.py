@@ -68,8 +68,8 @@ _PROJECTIONS = {name: name for name in ("maximum", "minimum", "mean")}
 _PROJECTIONS |= {"max": "maximum", "min": "minimum"}
 # Of `WideIsosurface`:
 _RAMP_ROWS = 1025  # of its table
-_RAMP_INTERVALS = 3.0  # width of its ramp; fitted so that penumbras agree best
-_MAX_RAMP_VOXELS = 16  # largest width of a distance field's ramp
+_RAMP_INTERVALS = 3.0  # width of its ramp, in intervals; fitted so that penumbras agree best
+_MAX_RAMP_VOXELS = 16  # largest width of a distance field's ramp, in voxels
 _OPAQUE_LENGTH = 1e-20  # a reference length so short that any opacity above 0 becomes 1
 
 

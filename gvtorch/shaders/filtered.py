@@ -55,7 +55,8 @@ from .shader import Sampling, Shader, check_width
 from .transfer_function import TransferFunction
 
 #: Results of `finer`: how many times finer than for other shaders levels are chosen. Fitted: the
-#: finest voxels are not filtered, so the sharper their detail, the farther away they must be left.
+#: finest voxels are not filtered, so the sharper their detail, the smaller the pixels must be that
+#: are drawn from them, and the smaller this factor.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE_ALPHA = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data

@@ -31,7 +31,7 @@ _MAX_SKIPPED_BYTES = 1 << 24  # of one line, or of unpacked data
 _SPACES = {"ras": "right-anterior-superior", "las": "left-anterior-superior"}
 _SPACES["lps"] = "left-posterior-superior"
 _SPATIAL_KINDS = ("domain", "space")
-_UNCLEAR_KINDS = ("???", "none", "list", "stub")  # of axes that may count slices
+_UNCLEAR_KINDS = ("???", "none", "list", "stub")  # they do not say what an axis counts
 #: Fields of the format; others are key/value pairs of the file's writer.
 _FIELDS = {
     *("type", "dimension", "sizes", "encoding", "endian", "data file", "block size", "byte skip"),
