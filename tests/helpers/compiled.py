@@ -19,7 +19,9 @@ HEADER = TESTS / "cpp" / "user_shaders.h"
 # What users' shaders include of torch and of the standard library: half of what is read.
 PREFIX = """
 #include <algorithm>
+#ifdef __x86_64__
 #include <immintrin.h>
+#endif
 #include <optional>
 #include <string_view>
 #include <tuple>
