@@ -121,7 +121,7 @@ struct Light {
   }
   // The cone to the light from distance t of the probe's ray.
   template <class AnyProbe, class V = typename AnyProbe::Number>
-  GV_HD LightCone<V> cone_from(const AnyProbe& probe, typename AnyProbe::Number t) const {
+  GV_HD LightCone<V> towards(const AnyProbe& probe, typename AnyProbe::Number t) const {
     const Parameters<T>& p = *parameters;
     const Vec3<V> d = probe.sight.direction;
     LightCone<V> cone{t, {-d.x, -d.y, -d.z}, broadcast<V>(static_cast<T>(INFINITY)), broadcast<V>(p.light_width)};
@@ -159,7 +159,7 @@ struct Light {
   template <class AnyProbe, class V = typename AnyProbe::Number>
   GV_HD Row<V> shade(const Row<typename AnyProbe::Number>& base, const Vec3<typename AnyProbe::Number>& n,
                      const AnyProbe& probe, typename AnyProbe::Number t) const {
-    const LitPoint<V> point = point_of(base, n, probe.sight.direction, cone_from(probe, t).direction);
+    const LitPoint<V> point = point_of(base, n, probe.sight.direction, towards(probe, t).direction);
     return lit(base, point.facing, point.highlight);
   }
   // True where a position's colour depends on how much light reaches it.
@@ -178,7 +178,7 @@ struct Light {
   GV_HD void add(MaskOf<V> mask, const Row<V>& base, const AnyProbe& probe, const Piece<V>& piece, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
     const Vec3<V> n = normal(probe, piece.middle);
-    const LightCone<V> cone = cone_from(probe, piece.middle);
+    const LightCone<V> cone = towards(probe, piece.middle);
     const LitPoint<V> point = point_of(base, n, probe.sight.direction, cone.direction);
     sum.add_normal(n, sum.clear * base.alpha, mask);
     if constexpr (sizeof...(shadow) > 0) {
@@ -216,7 +216,7 @@ struct Light {
     const V share = clamp(static_cast<T>(kFaint) * total, zero, one), divisor = select(total > 0, total, unity);
     m = {m.xx / divisor, m.xy / divisor, m.xz / divisor, m.yy / divisor, m.yz / divisor, m.zz / divisor};
     const V square = m.xx * m.xx + m.yy * m.yy + m.zz * m.zz + two * (m.xy * m.xy + m.xz * m.xz + m.yz * m.yz);
-    const Vec3<V> to_light = cone_from(probe, t).direction;
+    const Vec3<V> to_light = towards(probe, t).direction;
     normal = m.times(d);
     for (int axis = 0; axis < 3; ++axis) normal[axis] = -normal[axis];
     const V seen_rms = square_root(larger(V{}, -dot(d, normal)));
