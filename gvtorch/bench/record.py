@@ -18,7 +18,7 @@ import torch
 
 from .. import __version__
 from ..base import check
-from ..ops.trace import choose_backend
+from ..ops.registry import choose_backend
 
 #: Peers by their names in `--peers`, and the package that must be installed for each.
 PEERS = {

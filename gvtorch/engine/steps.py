@@ -14,7 +14,7 @@ from ..base import check
 from ..base.records import Hits, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
-from ..ops.trace import choose_backend
+from ..ops.registry import choose_backend
 from ..producers import Layout, Producer
 from ..tracing import RenderOptions
 from ..tracing.pixels import Again, View, empty_hits

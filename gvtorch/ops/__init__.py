@@ -20,15 +20,9 @@ from .cameras import pinhole_rays
 from .noise import noise
 from .orbits import Orbit, orbit_bounds, orbits
 from .registry import unavailable
+from .segments import composite, list_samples, sample_bricks, trace_segments
 from .splat import splat
-from .trace import (
-    composite,
-    list_samples,
-    sample_bricks,
-    shade_rays,
-    trace_rays,
-    trace_segments,
-)
+from .trace import shade_rays, trace_rays
 from .voxelize import voxelize
 
 __all__ = [

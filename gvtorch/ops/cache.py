@@ -27,13 +27,19 @@ from ..base.constants import (
     TERMINAL,
 )
 from ..base.volume import movable
-from .registry import Backend, Bytes, Flags, Longs, Requests, Words, choose_backend, op
+from .registry import Backend, Bytes, Flags, Longs, Requests, Words, choose_backend, fake_of, op
 
 Positive = Annotated[int, range(1, 2**31)]
 Branching = Annotated[int, range(2, 2**15)]  # N of a tree
 
 
-@op()
+@op(
+    fake=lambda *, request_tn, capacity: (
+        request_tn.new_empty((capacity,), dtype=torch.int32),
+        request_tn.new_empty((capacity,), dtype=torch.int32),
+        request_tn.new_empty((5,), dtype=torch.int64),
+    )
+)
 def compact_requests(
     request_tn: Requests, capacity: Positive, *, backend: Backend = "auto"
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -60,7 +66,12 @@ def compact_requests(
     return node_k, word_k, torch.tensor(counts, device=request_words.device)
 
 
-@op()
+@op(
+    fake=lambda *, asked_l2k, batch, **_: (
+        asked_l2k.new_empty((2, batch), dtype=torch.int64),
+        asked_l2k.new_empty((2, batch)),
+    )
+)
 def choose_requests(
     asked_l2k: Words,  # lists of nodes, -1 for none, and their words; earlier lists first
     loc_t4: Words,  # only the depth of each tile's nodes is read
@@ -97,7 +108,12 @@ def choose_requests(
     return node_2b, priority_2b
 
 
-@op()
+@op(
+    fake=lambda *, order_k, **_: (
+        torch.empty_like(order_k),
+        order_k.new_empty((1,), dtype=torch.int64),
+    )
+)
 def lru_partition(
     order_k: Words,  # slots, without those that never change hands
     stamp_s: Words,  # last frame that used each slot
@@ -271,7 +287,7 @@ def put_rows(
     target_sb[slot_k[valid]] = rows_kb[valid]
 
 
-@op()
+@op(fake=lambda *, node_k, **_: node_k.new_empty((node_k.shape[0], 4)))
 def locate(
     loc_t4: Words,  # x, y, z of each tile's parent, and the depth of the tile's nodes
     node_k: Longs,  # node indices
@@ -290,7 +306,7 @@ def locate(
     return torch.where(valid[:, None], torch.cat((loc, parent_loc[:, 3:]), 1), -1)
 
 
-@op()
+@op(fake=lambda *, node_k, **_: torch.empty_like(node_k, dtype=torch.bool))
 def lacking(
     pointer_tn: Words,  # child or brick words, by what was requested
     loc_t4: Words,
@@ -363,3 +379,9 @@ def cut_bricks(
     z, y, x = (voxel[:, axis].clamp(0, values_zyxc.shape[axis] - 1) for axis in range(3))
     index = (z[:, :, None, None], y[:, None, :, None], x[:, None, None, :])
     return movable(values_zyxc)[index].view(values_zyxc.dtype)
+
+
+@fake_of("cut_bricks")
+def _fake_bricks(*, values_zyxc: Tensor, place_k3: Tensor, brick_size: int, border: int) -> Tensor:
+    side = brick_size + 2 * border
+    return values_zyxc.new_empty((place_k3.shape[0], side, side, side, values_zyxc.shape[3]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -33,7 +35,11 @@ def _check_rows(*, camera_nc: Tensor, first: int, rows: int, width: int, height:
         raise ValueError(f"pinhole_rays: {rows} rows of {width} are too many at once")
 
 
-@op(_check_rows)
+def _fake_rays(*, camera_nc: Tensor, rows: int, width: int, **_: Any) -> tuple[Tensor, ...]:
+    return tuple(camera_nc.new_empty((rows * width, numbers)) for numbers in (3, 3, 2, 2))
+
+
+@op(_check_rows, fake=_fake_rays)
 def pinhole_rays(
     camera_nc: Doubles,  # see `PinholeColumns`
     first: Count,  # row, counted through the batch

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from .reference import noise as twin
-from .registry import Backend, runs_twin
+from .registry import Backend, fake_of, runs_twin
 
 KINDS = twin.KINDS
 
@@ -69,3 +70,8 @@ def noise(
         return twin.noise(point_pn, kind_index, arguments)
     scalars = (*(salt & 0xFFFFFFFF for salt in arguments.salt), x, y, z, jitter, reach)
     return torch.ops.gvtorch.noise(point_pn.contiguous(), kind_index, *scalars)
+
+
+@fake_of("noise", gradients=False)
+def _fake_values(*, point_pn: Tensor, **_: Any) -> Tensor:
+    return point_pn.new_empty((point_pn.shape[0],))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..base import check
 from .reference import orbits as twin
-from .registry import Backend, runs_twin, uncached_backend
+from .registry import Backend, fake_of, runs_twin, uncached_backend
 
 KINDS = ("power", "fold")
 
@@ -103,3 +103,13 @@ def orbit_bounds(
     if uncached_backend(backend, center_k3.device) == "reference":
         return twin.orbit_bounds(center_k3, reach_k, orbit.twin_orbit())
     return torch.ops.gvtorch.orbit_bounds(center_k3, reach_k, *orbit.arguments())
+
+
+@fake_of("orbits", gradients=False)
+def _fake_distances(*, point_p3: Tensor, **_: Any) -> Tensor:
+    return point_p3.new_empty((3, point_p3.shape[0]))
+
+
+@fake_of("orbit_bounds", gradients=False)
+def _fake_bounds(*, center_k3: Tensor, **_: Any) -> Tensor:
+    return center_k3.new_empty((2, center_k3.shape[0]))

@@ -1,11 +1,8 @@
-"""The ops on rays: they check their arguments and call a backend. `trace_rays` and `shade_rays`
-shade inside the kernel. Shaders outside it use three ops: `trace_segments` lists the runs of
-samples that rays take in bricks, `sample_bricks` reads any channel there, and `composite` sums the
-shader's colours. The last two are differentiable.
+"""`trace_rays` and `shade_rays`: rays through a tree, shaded inside the kernel.
 
-The ops and their shared checks raise ValueError for a tensor of the wrong shape, dtype or device
-and for a number out of its range; the message names op, argument and value. Checks return the size
-of each letter in the shapes.
+The ops and their shared checks, which those of `segments.py` use as well, raise ValueError for a
+tensor of the wrong shape, dtype or device and for a number out of its range; the message names op,
+argument and value. Checks return the size of each letter in the shapes.
 """
 
 from __future__ import annotations
@@ -18,13 +15,10 @@ from torch import Tensor
 from ..base import check
 from ..base import constants as config
 from ..base.volume import CHANNEL_DTYPES
-from .arguments import RayArguments, Samples, Segments, ShadeArguments, TraceArguments
+from .arguments import RayArguments, ShadeArguments, TraceArguments
 from .reference import march, shaders
-from .reference import segments as twins
-from .registry import Backend, choose_backend
+from .registry import Backend, choose_backend, fake_of
 from .shading import COLOR_WIDTH, SHADER_KINDS, ShaderFacts, channel_widths
-
-_SEGMENT_BYTES = 84  # at most, in float64
 
 
 def _fields(record: Any, dtype: torch.dtype, names: str) -> list[check.Field]:
@@ -217,158 +211,25 @@ def shade_rays(
     return shaders.shade_rays(rays, arguments, shading, parameter_54)
 
 
-def trace_segments(
-    rays: RayArguments,
-    arguments: TraceArguments,
-    state_r3: Tensor | None = None,
-    *,
-    limit: int = 0,
-    by_node: bool = False,
-    backend: Backend = "auto",
-) -> Segments:
-    """Walks rays through a tree as `trace_rays` does, and lists what they would sample.
-
-    It visits, stamps, requests and skips the same nodes and takes the same samples, but rays do not
-    end early, which only a shader can decide: with `limit` rays are walked in parts, and the caller
-    can drop those that have ended. Lists have exactly the needed size: rays are walked twice, and
-    the host waits for the count in between. The lists carry no gradients: those of colours and
-    voxels flow through `sample_bricks` and `composite`.
-
-    Args:
-        rays: The rays; their transmittance does not matter.
-        arguments: Tree, pools and transfer function, of whose table only the number of lengths
-            matters; mutated as by `trace_rays`.
-        state_r3: `Segments.state` of the previous part; None: from the start.
-        limit: A ray pauses after the visit in which it reaches this many samples; 0: never.
-        by_node: A region counts as constant only where no two nodes blend, for shaders that read
-            more than `component`.
-
-    Raises:
-        ValueError: An argument is invalid, or the segments do not fit into the device's memory.
-    """
-    context, device = "trace_segments", rays.origin_r3.device
-    sizes = check_trace(context, rays, arguments)
-    if state_r3 is not None:
-        fields = [("state_r3", state_r3, "r3", arguments.table_lm4.dtype)]
-        check.tensors(context, device, fields, sizes)
-    check.integer(context, "limit", limit, low=0, high=2**31 - 1)
-    op_arguments = (*rays, *arguments, state_r3, limit, by_node)
-    with torch.no_grad():
-        if choose_backend(backend, device) == "reference":
-            return twins.walk_segments(rays, arguments, state_r3, limit, by_node)
-        op = torch.ops.gvtorch
-        count, state, missed = op.count_segments(*op_arguments)
-        ends = count[:, 0].cumsum(0, dtype=torch.int64)
-        total = int(ends[-1]) if sizes["r"] else 0
-        check.memory(context, f"a list of {total} segments", total * _SEGMENT_BYTES, device)
-        lists = op.write_segments(*op_arguments, ends - count[:, 0], total)
-        return Segments._make((*lists, count, state, missed))
-
-
-def list_samples(segments: Segments) -> Samples:
-    """Lists the samples of segments. The host waits for their number.
-
-    Raises:
-        ValueError: There are more than int32 can count, or than the device has memory for.
-    """
-    count, device = segments.interval[:, 1].to(torch.int64), segments.interval.device
-    offset = torch.zeros(len(segments.counts) + 1, dtype=torch.int64, device=device)
-    torch.cumsum(segments.counts[:, 1], 0, dtype=torch.int64, out=offset[1:])
-    total = int(offset[-1])
-    check.memory("list_samples", f"a list of {total} samples", 8 * total, device)
-    check.integer("list_samples", "the number of samples", total, low=0, high=2**31 - 1)
-    first = count.cumsum(0) - count
-    segment_index = torch.arange(len(count), device=device)
-    segment = torch.repeat_interleave(segment_index, count, output_size=total)
-    number = torch.arange(total, device=device) - first[segment]
-    return Samples(segment.to(torch.int32), number.to(torch.int32), offset)
-
-
-def sample_bricks(
-    rays: RayArguments,
-    arguments: TraceArguments,
-    segments: Segments,
-    samples: Samples,
-    *,
-    backend: Backend = "auto",
-) -> Tensor:
-    """Reads all numbers of a channel at samples: trilinear, two levels blended, in the same bits as
-    `trace_rays` reads one of them. Differentiable by bricks and constants that are floats.
-
-    Args:
-        rays: The rays that were walked.
-        arguments: The arguments of the walk, with the bricks and constants of any channel.
-        segments: Result of `trace_segments`.
-        samples: Result of `list_samples`, or some of its samples. A sample whose segment does not
-            exist, or whose segment names a ray, node or slot that does not, is 0.
-
-    Returns:
-        (k, c) in the segments' dtype.
-    """
-    context, device = "sample_bricks", rays.origin_r3.device
-    chosen_backend = choose_backend(backend, device)
-    if chosen_backend != "reference":  # the reference also reads float64
-        check_voxels(context, arguments)
-    check_rays(context, rays)
-    check_channel(context, arguments, device)
-    check_real(context, "distance", segments.distance, "(s, 3)")
-    tensors = (*segments[:6], samples.segment, samples.number)
-    names = (*Segments._fields[:6], "segment", "number")
-    shapes = ("s", "s2", "s2", "s3", "s3", "s3", "k", "k")
-    dtypes = (*[torch.int32] * 5, segments.distance.dtype, torch.int32, torch.int32)
-    check.tensors(context, device, zip(names, tensors, shapes, dtypes, strict=True))
-    if chosen_backend == "reference":
-        return twins.sample_bricks(rays, arguments, segments, samples)
-    return torch.ops.gvtorch.sample_bricks(*rays, *arguments.channel, *tensors)
-
-
-def composite(
-    alpha_k: Tensor,
-    feature_kc: Tensor,
-    offset_r: Tensor,
-    clear_r: Tensor | None = None,
-    *,
-    stop_alpha: float = 1.0,
-    backend: Backend = "auto",
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Composites samples along rays, front to back: a sample's weight is its alpha times the
-    transmittance before it. Differentiable by alpha, features and `clear_r`, also at an alpha of 1.
-
-    Args:
-        alpha_k: (k,) float32 or float64 in [0, 1].
-        feature_kc: (k, c) same dtype: colour, or any numbers; not premultiplied.
-        offset_r: (r + 1,) int64 `Samples.offset`, rising from 0 to k.
-        clear_r: (r,) transmittance before a ray's first sample; None: 1.
-        stop_alpha: A ray ends at this alpha.
-
-    Returns:
-        Sums (r, c), transmittance that is left (r,), and the transmittance before each sample (k,),
-        0 behind the end of a ray; the third has no gradient.
-    """
-    context = "composite"
-    alpha_k = check.instance(context, "alpha_k", alpha_k, Tensor)
-    device, dtype = alpha_k.device, alpha_k.dtype
-    check_real(context, "alpha_k", alpha_k, "(k,)")
-    length = len(offset_r) if check.instance(context, "offset_r", offset_r, Tensor).dim() else 0
-    rays = check.integer(context, "offset_r's length", length, low=1) - 1
-    clear = alpha_k.new_ones(rays) if clear_r is None else clear_r
-    fields = (
-        ("alpha_k", alpha_k, "k", dtype),
-        ("feature_kc", feature_kc, "kc", dtype),
-        ("offset_r", offset_r, "o", torch.int64),
-        ("clear_r", clear, "r", dtype),
-    )
-    check.tensors(context, device, fields, {"r": rays, "o": rays + 1})
-    stop_clear = 1 - check.number(context, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
-    op_arguments = (alpha_k, feature_kc, offset_r, clear, stop_clear)
-    if choose_backend(backend, device) == "reference":
-        total, remaining, before = twins.composite(*op_arguments)
-        return total, remaining, before.detach()
-    return torch.ops.gvtorch.composite(*op_arguments)
-
-
 def shade_op(name: str | None) -> Any:
     """Returns the op of a user's shader, or for None that of the fused shaders."""
     if name is None:
         return torch.ops.gvtorch.shade_rays
     return getattr(torch.ops.gvtorch_user, name)
+
+
+@fake_of("trace_rays", gradients=False)
+def _fake_hits(*, origin_r3: Tensor, table_lm4: Tensor, **_: Any) -> tuple[Tensor, ...]:
+    rays = origin_r3.shape[0]
+    return (
+        *(table_lm4.new_empty((rays, width)) for width in (3, 1, 1)),
+        table_lm4.new_empty((rays,), dtype=torch.int32),
+        table_lm4.new_empty((rays,), dtype=torch.bool),
+    )
+
+
+@fake_of("shade_rays", gradients=False)
+def _fake_shaded_hits(*, table_lm4: Tensor, features: int, **arguments: Any) -> tuple[Tensor, ...]:
+    hits = _fake_hits(table_lm4=table_lm4, **arguments)
+    rays = hits[0].shape[0]
+    return (*hits, *(table_lm4.new_empty((rays, width)) for width in (3, features)))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..base import check
 from .reference import voxelize as twin
-from .registry import Backend, choose_backend
+from .registry import Backend, choose_backend, fake_of
 
 MAX_CUBE_SIDE = 32  # along a side of a cube
 ARITY = 8  # boxes in a box
@@ -104,3 +104,15 @@ def boxes_of(triangles: int) -> int:
         floor_boxes = -(-floor_boxes // ARITY)
         total += floor_boxes
     return total
+
+
+@fake_of("voxelize")
+def _fake_cubes(
+    *, low_k3: Tensor, side: int, shares: bool, weights: bool, wide: bool, **_: Any
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    cubes, shape = low_k3.shape[0], (side, side, side)
+    float_volume = low_k3.new_empty((cubes, *shape), dtype=torch.float64 if wide else torch.float32)
+    int_volume = torch.empty_like(float_volume, dtype=torch.int32)
+    share = float_volume.new_empty((cubes if shares else 0, *shape))
+    weight = float_volume.new_empty((cubes if weights else 0, *shape, 3))
+    return float_volume, int_volume, torch.empty_like(int_volume), share, weight

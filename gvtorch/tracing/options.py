@@ -14,7 +14,7 @@ from torch import Tensor
 from ..base import check
 from ..base import constants as config
 from ..cameras.camera import Camera
-from ..ops.trace import Backend
+from ..ops.registry import Backend
 from ..pictures.background import Background, checked_background
 from .clip import Clip
 from .layer import Layer

@@ -22,8 +22,8 @@ from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
+from ..ops.registry import choose_backend
 from ..ops.shading import pack
-from ..ops.trace import choose_backend
 from ..pictures.background import Background
 from ..pictures.picture import Picture
 from ..pool import N3Tree

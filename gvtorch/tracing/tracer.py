@@ -19,7 +19,7 @@ from .. import ops
 from ..base import check
 from ..base.constants import MAX_INTERVALS
 from ..base.records import Hits, Rays
-from ..ops.trace import choose_backend
+from ..ops.registry import choose_backend
 from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Sampling, Shader, check_shader, interval_levels

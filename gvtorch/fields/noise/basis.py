@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from ...base import check
-from ...ops import noise
+from ...ops.noise import noise
 
 #: Points (..., n), or n coordinates that broadcast to one shape.
 Points = Tensor | Sequence[Tensor]

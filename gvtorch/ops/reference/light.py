@@ -243,7 +243,7 @@ class Shadows:
             shader.transfer, shader.channel, shader, direction, torch.ones_like(t), *limits
         )
         walk = Walk(intervals, self.walk.tree, shader.channel)
-        walk.go(visitor)
+        walk.follow(visitor)
         self.samples[ray_index] += walk.samples
         self.missed[ray_index] |= walk.missed
         return torch.ones_like(length).index_put((ray_index,), visitor.clear)

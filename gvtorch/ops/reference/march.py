@@ -271,13 +271,13 @@ class Walk:
         beam = Beam.enter(rays, args, args.table_lm4.dtype)
         return cls(Intervals(beam, args.step, len(args.table_lm4)), Tree(args), channel.of(args))
 
-    def go(self, visitor: Visitor) -> None:
+    def follow(self, visitor: Visitor) -> None:
         """Walks every ray to the scene's far side, or until it ends."""
         intervals, leaving = self.intervals, torch.ones_like(self.missed)
         active = intervals.inside() & visitor.goes_on(leaving)
         while active.any():
             if (active & leaving).any():
-                self.look_up((active & leaving).nonzero()[:, 0], intervals.middle, visitor)
+                self.find((active & leaving).nonzero()[:, 0], intervals.middle, visitor)
             visit = self.visit
 
             # A node of one value, or of none, is crossed in one step; else one interval is added.
@@ -305,7 +305,7 @@ class Walk:
             leaving = one_step | ~stays
             active = intervals.inside() & visitor.goes_on(leaving)
 
-    def look_up(self, ray_index: Tensor, t: Tensor, visitor: Visitor) -> None:
+    def find(self, ray_index: Tensor, t: Tensor, visitor: Visitor) -> None:
         """Finds the nodes of the rays `ray_index` (k,) at t (r,); stamps what is used and requests
         what is absent.
         """
@@ -327,7 +327,7 @@ class Walk:
         coarse = tree.holder(coarse_node, coarse_depth, finest, beam)
         hidden = descent.hidden & ((descent.depth < wanted) | ~blends)
         tree.stamp(torch.cat((fine.brick[~hidden], coarse.brick[~hidden])))
-        missed = tree.mark(descent, wanted, blends, cone, ~hidden)
+        missed = tree.mark_missing(descent, wanted, blends, cone, ~hidden)
 
         empty = (fine.brick == EMPTY) & (coarse.brick == EMPTY)
         invisible = hidden | (descent.fine < 0) | (empty & (not visitor.sees_empty))
@@ -382,5 +382,5 @@ def trace_rays(
     """Twin of `ops.trace_rays`. The rays' `width` only orders them, so it is ignored."""
     walk = Walk.enter(rays, arguments)
     plain = Plain.begin(rays, arguments, walk)
-    walk.go(plain)
+    walk.follow(plain)
     return *plain.sum.hits(walk.intervals.beam), walk.samples, walk.missed

@@ -95,7 +95,7 @@ def walk_segments(
     if state_r3 is not None:
         walk.intervals.resume(state_r3)
     writer = SegmentWriter(Transfer(args), walk.channel, walk, limit, by_node)
-    walk.go(writer)
+    walk.follow(writer)
     return writer.segments()
 
 

@@ -121,7 +121,7 @@ class Isosurface(Lit):
         """Shades the surface points found; each looks its node up once more."""
         self.is_hit = self.sum.depth < INF
         t = torch.where(self.is_hit, self.sum.depth, 0.0)
-        walk.look_up(self.is_hit.nonzero()[:, 0], t, self)
+        walk.find(self.is_hit.nonzero()[:, 0], t, self)
         probe = Probe(walk.intervals.beam, walk.visit, self.channel)
         normal = self.light.normal_at(probe, t)
         normal = torch.where((self.last_end < INF)[:, None], normal, 0.0)
@@ -246,7 +246,7 @@ def shade_rays(
         *(rays, arguments, walk, light, other, features),
         shadows if facts.shadows else None,
     )
-    walk.go(shader)
+    walk.follow(shader)
     shader.done(walk)
     return (
         *shader.sum.hits(beam),

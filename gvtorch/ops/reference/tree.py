@@ -146,7 +146,7 @@ class Tree:
         brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)].to(torch.int64), ABSENT)
         return self.levels.holder(node, brick, depth, finest, beam)
 
-    def mark(
+    def mark_missing(
         self, descent: Descent, wanted: Tensor, blends: Tensor, cone: Tensor, visible: Tensor
     ) -> Tensor:
         """Requests absent tiles and bricks where something is seen, straight to the wanted level or

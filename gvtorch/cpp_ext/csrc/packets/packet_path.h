@@ -54,17 +54,14 @@ struct PacketPath {
     const Ray<float> lane_ray(walk.rays, ray_number);
     put_ray(lane, lane_ray, {walk.rays, ray_number, lane_ray.moved}, {lane_ray, walk.step, lengths});
   }
-  // Begins a cone in a lane, see ShadeRay::share_of_light; it begins on the ray of a lane of another packet.
+  // Begins a cone in a lane, see ShadeRay::light_share; it begins on the ray of a lane of another packet.
   GV_CALL void begin_cone(int lane, const LightCone<float>& cone, const PacketPath& from, int from_lane) {
     const Vec3<float> origin = lane_of(from.ray.origin, from_lane), direction = lane_of(from.ray.direction, from_lane);
     Vec3<double> position;
     for (int axis = 0; axis < 3; ++axis) position[axis] = origin[axis] + cone.t * direction[axis];
     if (walk.rays.deep) position = from.deep_lanes.along(from_lane, direction, cone.t);
-    Vec3<float> cube;
-    for (int axis = 0; axis < 3; ++axis) cube[axis] = static_cast<float>(walk.rays.place_33[3 + axis]);
-    const float cone_near = from.intervals.cone_near[from_lane] + from.intervals.cone_growth[from_lane] * cone.t;
-    const float cone_growth = cone.growth * static_cast<float>(walk.rays.cone_scale);
-    const Ray<float> beam(walk.rays, position, cone.direction, cube, cone_near, cone_growth, cone.length);
+    const float near = from.intervals.cone_near[from_lane] + from.intervals.cone_growth[from_lane] * cone.t;
+    const Ray<float> beam(walk.rays, position, cone.direction, near, cone.growth, cone.length);
     Intervals<float> beam_intervals(beam, walk.step, lengths);
     beam_intervals.move_to(true, beam_intervals.count + 1);
     put_ray(lane, beam, {take_lane<Sight<float>>(from.sight, from_lane).at(cone.t), cone.direction}, beam_intervals);
@@ -88,57 +85,24 @@ struct PacketPath {
   // The same for other shaders: hidden_from(mask, node) gives the lanes of `mask` to which their node shows nothing.
   template <class HiddenFrom>
   GV_HD Found find(Mask mask, bool sees_empty, const HiddenFrom& hidden_from) {
-    const TreeView& tree = walk.tree;
-    const Levels<float>& levels = walk.levels;
     const Floats middle = intervals.middle();
     const Floats cone = intervals.cone(middle);
-    Floats wanted_voxel = pick(levels.voxel, wanted);
-    for (;;) {
-      const Mask finer = mask & (wanted < tree.max_depth) & (wanted_voxel > cone);
-      if (!any(finer)) break;
-      wanted = wanted - finer;
-      wanted_voxel = pick(levels.voxel, wanted);
-    }
-    Floats voxel_above;
-    for (;;) {
-      voxel_above = pick(levels.voxel, larger(wanted - 1, Ints{}));
-      const Mask coarser = mask & (wanted > 0) & ~(voxel_above > cone);
-      if (!any(coarser)) break;
-      wanted = wanted + coarser;
-      wanted_voxel = coarser ? voxel_above : wanted_voxel;
-    }
-    voxel_above = wanted > 0 ? voxel_above : Floats{} + INFINITY;
-    const Mask reached = wanted_voxel <= cone;
-    const Mask blend = reached & (wanted > 0);
-    extent.cone_low = mask ? (reached ? wanted_voxel : Floats{} - INFINITY) : extent.cone_low;
-    extent.cone_high = mask ? (reached ? voxel_above : wanted_voxel) : extent.cone_high;
-    voxel = mask ? wanted_voxel : voxel;
-    blend_scale = mask ? 1.0f / (voxel_above - wanted_voxel) : blend_scale;
+    const Mask blend = choose_depth(mask, cone);
 
     Ints depth, node, brick, tile;
     descend(mask, middle, hidden_from, depth, node, brick, tile);
     const Mask hidden_nodes = node < 0;
-    const Floats size = pick(levels.size, depth);
+    const Floats size = pick(walk.levels.size, depth);
     const Floats exit = ray.exit_distance([&](int axis, Mask upper) { return face(mask, axis, depth, size, upper); });
     extent.exit = mask ? exit : extent.exit;
 
     // The nodes whose bricks are read.
     Ints fine_level = depth, fine_brick = brick;
-    for (;;) {
-      const Mask higher = mask & (fine_level > 0) & (fine_brick == kAbsent);
-      if (!any(higher)) break;
-      fine_level = fine_level + higher;
-      fine_brick = higher ? path_entry(path_brick, fine_level) : fine_brick;
-    }
+    climb(mask, Ints{} + kMaxLevels, fine_level, fine_brick);
     Ints coarse_level = fine_level, coarse_brick = fine_brick;
     const Mask blends = mask & blend;
     if (any(blends)) {
-      for (;;) {
-        const Mask higher = blends & (coarse_level > 0) & ((coarse_level >= wanted) | (coarse_brick == kAbsent));
-        if (!any(higher)) break;
-        coarse_level = coarse_level + higher;
-        coarse_brick = higher ? path_entry(path_brick, coarse_level) : coarse_brick;
-      }
+      climb(blends, wanted, coarse_level, coarse_brick);
       const Mask has_coarse = blends & (coarse_level < wanted) & (coarse_brick != kAbsent);
       coarse_level = has_coarse ? coarse_level : fine_level;
       coarse_brick = has_coarse ? coarse_brick : fine_brick;
@@ -208,6 +172,43 @@ struct PacketPath {
     put_lane(intervals, lane, lane_intervals);
     number[lane] = lane_intervals.count;
     if (walk.rays.deep) deep_lanes.begin(lane, lane_ray);
+  }
+
+  // Level of detail: sets `wanted`, the first depth whose voxel fits into the cone, and how it blends with the depth
+  // above. Returns the lanes that do: where no voxel fits, the finest is read alone.
+  GV_HD Mask choose_depth(Mask mask, Floats cone) {
+    const Levels<float>& levels = walk.levels;
+    Floats wanted_voxel = pick(levels.voxel, wanted);
+    for (;;) {
+      const Mask finer = mask & (wanted < walk.tree.max_depth) & (wanted_voxel > cone);
+      if (!any(finer)) break;
+      wanted = wanted - finer;
+      wanted_voxel = pick(levels.voxel, wanted);
+    }
+    Floats voxel_above;
+    for (;;) {
+      voxel_above = pick(levels.voxel, larger(wanted - 1, Ints{}));
+      const Mask coarser = mask & (wanted > 0) & ~(voxel_above > cone);
+      if (!any(coarser)) break;
+      wanted = wanted + coarser;
+      wanted_voxel = coarser ? voxel_above : wanted_voxel;
+    }
+    voxel_above = wanted > 0 ? voxel_above : Floats{} + INFINITY;
+    const Mask reached = wanted_voxel <= cone;
+    extent.cone_low = mask ? (reached ? wanted_voxel : Floats{} - INFINITY) : extent.cone_low;
+    extent.cone_high = mask ? (reached ? voxel_above : wanted_voxel) : extent.cone_high;
+    voxel = mask ? wanted_voxel : voxel;
+    blend_scale = mask ? 1.0f / (voxel_above - wanted_voxel) : blend_scale;
+    return reached & (wanted > 0);
+  }
+  // Moves lanes up their paths while they are not above depth `below`, or have no brick.
+  GV_HD void climb(Mask mask, Ints below, Ints& level, Ints& brick) const {
+    for (;;) {
+      const Mask higher = mask & (level > 0) & ((level >= below) | (brick == kAbsent));
+      if (!any(higher)) return;
+      level = level + higher;
+      brick = higher ? path_entry(path_brick, level) : brick;
+    }
   }
 
   // The same as `descend` in tree.h, level by level for all lanes; those whose path is known to a deeper level wait.

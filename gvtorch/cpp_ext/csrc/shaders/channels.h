@@ -22,6 +22,7 @@
 #pragma once
 
 #include "shaders/light.h"
+#include "shaders/plain.h"
 
 namespace gvtorch::GV_NAMESPACE {
 

@@ -1,6 +1,5 @@
-// What the fused shaders share: `look_up`, the transfer function over an interval; Light, the lighting of a position;
-// ShaderFacts, the facts that every shader declares; and Plain, the simplest shader. The head of shaders.h explains
-// what a shader is. T is float, double or Floats (arithmetic.h).
+// Light: how a position is lit, from its colour, its normal and the share of the light that reaches it.
+// T is float or double; V is T, or Floats for a packet (arithmetic.h).
 //
 // Sources: Blinn, "Models of light reflection for computer synthesized pictures", SIGGRAPH 1977; Wrenninge, Kulla,
 // Lundqvist, "Oz: the great and volumetric", SIGGRAPH 2013 talks; Henyey, Greenstein, "Diffuse radiation in the
@@ -12,28 +11,12 @@
 
 namespace gvtorch::GV_NAMESPACE {
 
-// The transfer function's colour of a value, and its alpha over an interval of any length.
-template <class T, class V>
-GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece, T step,
-                     MaskOf<V> mask = all_lanes<V>()) {
-  Row<V> row = transfer.look_up(value, piece.level, mask);
-  if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
-  return row;
-}
-
 // x^power for x in [0, 1].
 template <class T, class Power>
 GV_HD T power_of(T x, Power power) {
   const MaskOf<T> positive = x > static_cast<RealOf<T>>(1.1754944e-38f);
   if (!any(positive)) return T{};
   return select(positive, exp2_exact(log2_exact(x) * power), T{});
-}
-
-// A shader's own parameters by name: a struct of at most four numbers.
-template <class Numbers, class T>
-GV_HD const Numbers& own_numbers(const Parameters<T>* parameters) {
-  static_assert(sizeof(Numbers) <= sizeof(parameters->own));
-  return *reinterpret_cast<const Numbers*>(parameters->own);
 }
 
 // Factors of an octave of scattering over the one before it: of its light, and of its anisotropy. Fitted to path traced
@@ -281,57 +264,5 @@ struct Light {
     return stop_clear;
   }
 };
-
-// Facts about a shader that the compiler must know: the walks and the checks of arguments read them. A shader inherits
-// these defaults and overrides what differs. The first line and kReadsAll are explained in the head of shaders.h.
-struct ShaderFacts {
-  static constexpr bool kEnds = false, kSeesEmpty = false, kSurface = false, kHidesAlike = true;
-  static constexpr bool kReadsAll = false;
-  static constexpr bool kShort = false;       // `add` is short: its loop may be compiled several times
-  static constexpr bool kToLight = false;     // it follows rays to a light, see ShadowShader
-  static constexpr bool kIntegrates = false;  // its table is (l, m, m, 4)
-  static constexpr bool kColored = false;     // its channel holds red, green, blue and opacity, once or by direction
-  static constexpr int32_t kFiltered = 0;     // above 0: numbers that a voxel of its second channel has, once or for
-                                              // each of six directions; only the pool's first bricks have the channel
-  static constexpr int32_t kFeatures = 0;     // how many numbers it writes to sum.feature_c; they begin as 0
-  static constexpr int32_t kAsOther = -1;     // for kFeatures: as many as the second channel holds
-  template <class V>
-  using SumOf = ShadeSum<V>;
-  template <class Sum>
-  GV_HD void done(Sum&) const {}
-};
-
-// The plain transfer function. Table: TransferTable or Transfer.
-template <class T, class Table = TransferTable<T>>
-struct Plain : ShaderFacts {
-  static constexpr bool kShort = true;
-  using Sum = ShadeSum<T>;
-  Table transfer;
-  T step;
-
-  explicit Plain(const TraceArgs& args) : transfer(args), step(static_cast<T>(args.step)) {}
-  template <class OtherTable>
-  GV_HD explicit Plain(const Plain<T, OtherTable>& other) : transfer(other.transfer), step(other.step) {}
-
-  template <class AnySum>
-  GV_HD bool hides(T low, T high, const AnySum&) const {
-    return Transfer<T>(transfer).transparent(low, high);
-  }
-  template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, ShadeSum<V>& sum) const {
-    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
-    if (!all_transparent(mask, row.alpha)) sum.add(row, piece, mask);
-  }
-};
-
-// The shader that a ray carries, with what all of its samples need already read from memory.
-template <class Shader>
-GV_HD const Shader& ready_for_ray(const Shader& shader) {
-  return shader;
-}
-template <class T>
-GV_HD Plain<T, Transfer<T>> ready_for_ray(const Plain<T>& shader) {
-  return Plain<T, Transfer<T>>(shader);
-}
 
 }  // namespace gvtorch::GV_NAMESPACE

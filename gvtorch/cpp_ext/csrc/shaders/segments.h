@@ -271,8 +271,7 @@ struct FindSample {
       source.coarse = Spot<T>(holders[1], digits, ray, border);
       const T voxel = walk.levels.voxel[wanted];
       const T blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
-      const T cone = ray.cone_near + ray.cone_growth * source.t;
-      source.weight = saturate((cone - voxel) * blend);
+      source.weight = saturate((ray.cone(source.t) - voxel) * blend);
     }
     return source;
   }

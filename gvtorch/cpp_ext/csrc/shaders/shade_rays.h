@@ -66,7 +66,7 @@ struct ShadeRay : Walk<T> {
     const auto& ready = ready_for_ray(shader);
     const auto add_lit = [&](const auto& probe, const Piece<T>& piece, const LitPoint<T>& point,
                              const LightCone<T>& cone, int32_t& samples) {
-      const T share = light.receives(point) ? share_of_light(ray, probe, cone, samples, sum.missed) : static_cast<T>(1);
+      const T share = light.receives(point) ? light_share(ray, probe, cone, samples, sum.missed) : static_cast<T>(1);
       sum.add(light.in_shadow(point, share), piece);
     };
     Visitor<std::decay_t<decltype(ready)>, std::decay_t<decltype(add_lit)>> visitor{
@@ -139,8 +139,7 @@ struct ShadeRay : Walk<T> {
     AnyDigits digits(tree, this->levels, this->rays, ray, sum.depth);
     int32_t wanted = 0;
     const auto read_words = [&](int32_t node) { return tree.words_of(node, false); };
-    const T cone = ray.cone_near + ray.cone_growth * sum.depth;
-    const Visit<T> visit = this->find(ray, digits, cone, read_words, wanted, sum.missed);
+    const Visit<T> visit = this->find(ray, digits, ray.cone(sum.depth), read_words, wanted, sum.missed);
     shader.surface(Probe<T>(channels, sight, this->rays, ray, visit, digits), sum);
   }
 
@@ -274,12 +273,11 @@ struct ShadeRay : Walk<T> {
  private:
   // Share of the light that reaches the position at the tip of a cone. The cone begins as wide as the ray's is there;
   // its first interval is left out, so that a position does not shadow itself.
-  GV_HD T share_of_light(const Ray<T>& ray, const Probe<T>& probe, const LightCone<T>& cone, int32_t& samples,
-                         bool& missed) const {
+  GV_HD T light_share(const Ray<T>& ray, const Probe<T>& probe, const LightCone<T>& cone, int32_t& samples,
+                      bool& missed) const {
     const RayView& rays = this->rays;
     const Vec3<double> position = ray.along(cone.t, Digits::kDeep && rays.deep);
-    const Ray<T> beam(rays, position, cone.direction, probe.cube, ray.cone_near + ray.cone_growth * cone.t,
-                      cone.growth * static_cast<T>(rays.cone_scale), cone.length);
+    const Ray<T> beam(rays, position, cone.direction, ray.cone(cone.t), cone.growth, cone.length);
     const Sight<T> sight(probe.sight.at(cone.t), cone.direction);
     Intervals<T> intervals(beam, step, lengths);
     intervals.move_to(true, intervals.count + 1);

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "shaders/light.h"
+#include "shaders/plain.h"
 
 namespace gvtorch::GV_NAMESPACE {
 

@@ -71,15 +71,13 @@ struct Ray {
     if (!moves || !(zero == 0)) last = first;  // without a direction, or with NaN or infinity
   }
 
-  // A secondary cone from a position inside the scene (tree units), along a direction in the world.
-  GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> world_direction, Vec3<T> cube, T cone_near, T cone_growth,
-            T last)
-      : direction{world_direction.x / cube.x, world_direction.y / cube.y, world_direction.z / cube.z},
-        cone_near(cone_near),
-        cone_growth(cone_growth),
-        first(0),
-        last(last),
-        moved(0) {
+  // A secondary cone from a position inside the scene (tree units), along a direction in the world. `near` and
+  // `growth`: its width there and per unit of length, the latter before cone_scale.
+  GV_HD Ray(const RayView& rays, Vec3<double> start, Vec3<T> world_direction, T near, T growth, T last)
+      : cone_near(near), cone_growth(growth * static_cast<T>(rays.cone_scale)), first(0), last(last), moved(0) {
+    for (int axis = 0; axis < 3; ++axis) {
+      direction[axis] = world_direction[axis] / static_cast<T>(rays.place_33[3 + axis]);
+    }
     begin(rays, start);
   }
 
@@ -105,6 +103,9 @@ struct Ray {
     const bool is_cone = cone_near == cone_near && cone_growth == cone_growth;
     if (!is_cone || !(last < static_cast<T>(INFINITY))) last = first;
   }
+
+  // Width of the cone at distance t.
+  GV_HD T cone(T t) const { return cone_near + cone_growth * t; }
 
   // The origin along an axis, with what rounding removed.
   GV_HD double exact_origin(int axis) const {

@@ -155,7 +155,7 @@ struct Walk {
 
   // Finds the node in which an interval's middle lies; marks what is used and what is missing. `wanted` enters as the
   // depth that the previous visit wanted. Level of detail: the first depth whose voxel fits into the cone
-  // (packet_path.h has the same for packets; Levels.wanted in the twin).
+  // (`PacketPath::choose_depth` is the same for packets, `Levels.wanted` in the twin).
   template <class Digits, class ReadWords>
   GV_HD Visit<T> find(const Ray<T>& ray, Digits& digits, T cone, const ReadWords& read_words, int32_t& wanted,
                       bool& missed) const {
