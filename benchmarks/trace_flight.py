@@ -1,5 +1,5 @@
 """Plots what host and device do in frames of a flight through a store: above, the stages of some
-frames (`gv.Trace`, whose file Perfetto shows as well); below, the kernels of one frame on the
+frames (`gv.Timeline`, whose file Perfetto shows as well); below, the kernels of one frame on the
 device, grouped by purpose (`torch.profiler`; CUDA).
 """
 
@@ -66,7 +66,7 @@ def fly(settings: Settings, store: Path) -> tuple[list[dict[str, Any]], list[dic
         drawn = settings.before + settings.frames
         for camera in cameras[: settings.before]:
             graph.replay(camera)
-        with gv.Trace(settings.trace, engine.device):
+        with gv.Timeline(settings.trace, engine.device):
             for camera in cameras[settings.before : drawn]:
                 graph.replay(camera)
         activities = [torch.profiler.ProfilerActivity.CUDA]

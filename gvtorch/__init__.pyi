@@ -109,7 +109,7 @@ from .tracing import (
 )
 
 # Timings of stages.
-from .base.stage import Trace as Trace
+from .base.stage import Timeline as Timeline
 
 # Streaming a scene larger than memory.
 from .engine import (

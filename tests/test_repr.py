@@ -42,7 +42,7 @@ def test_objects_tell_of_themselves_in_one_line(tree):
         (gv.Progressive(print), "Progressive(None, 0 frames)"),
         (gv.Video("a.gif", 8, 6), "Video('a.gif', 8x6)"),
         (gv.Overlay(320, 240), "Overlay(320x240, 0 annotations)"),
-        (gv.Trace("a.json"), "Trace('a.json', 0 stages)"),
+        (gv.Timeline("a.json"), "Timeline('a.json', 0 stages)"),
         (tree, "N3Tree(8x8x8"),
         (GRAY, "TransferFunction(3 opacities, 2 colours, from 0 to 1)"),
         (gv.Lit(GRAY, normals="n"), "Lit(normals='n', transfer=TransferFunction("),

@@ -1,6 +1,6 @@
 """Named stages of a frame: `with stage("trace"):` reports to the timer, torch's profiler, an open
-`Trace`, and as NVTX ranges to NVIDIA's tools. `Trace`: when each stage ran, in all threads and on
-the device, as a file for Perfetto (ui.perfetto.dev) or chrome://tracing.
+`Timeline`, and as NVTX ranges to NVIDIA's tools. `Timeline`: when each stage ran, in all threads
+and on the device, as a file for Perfetto (ui.perfetto.dev) or chrome://tracing.
 
 Times are differences of marks. On CUDA a mark is an event in the stream: recording one does not
 make the host wait, reading the time between two does.
@@ -68,7 +68,7 @@ class Timings:
 
 
 _timings: ContextVar[Timings | None] = ContextVar("gvtorch_timings", default=None)
-_traces: list[Trace] = []  # those that are open, in all threads
+_timelines: list[Timeline] = []  # those that are open, in all threads
 #: Nsight Systems and Compute set the first variable; users set the second to get ranges anyway.
 _NVTX_ENABLED = torch.version.cuda is not None and bool(
     {"NVTX_INJECTION64_PATH", "GVTORCH_NVTX"} & set(os.environ)
@@ -77,7 +77,7 @@ _NVTX_ENABLED = torch.version.cuda is not None and bool(
 
 class stage:  # not a generator-based context manager, which is slower: a frame has several stages
     """Names the stage that the block runs, for `collect_timings`, torch's profiler, NVTX and open
-    `Trace`s; costs next to nothing where none of them is active.
+    `Timeline`s; costs next to nothing where none of them is active.
     """
 
     __slots__ = ("_began", "_name", "_ranges", "_start", "_timings")
@@ -90,7 +90,7 @@ class stage:  # not a generator-based context manager, which is slower: a frame 
         self._ranges = None
         if _NVTX_ENABLED or torch.autograd._profiler_enabled():
             self._ranges = _open_ranges(f"gvtorch.{self._name}")
-        self._began = [(trace, trace.begin()) for trace in _traces]
+        self._began = [(timeline, timeline.begin()) for timeline in _timelines]
         self._timings = timings = _timings.get()
         self._start = None if timings is None else mark(timings.device)
 
@@ -98,8 +98,8 @@ class stage:  # not a generator-based context manager, which is slower: a frame 
         timings, start = self._timings, self._start
         if timings is not None and start is not None:
             timings.spans.append((self._name, start, mark(timings.device)))
-        for trace, began in self._began:
-            trace.end(self._name, began)
+        for timeline, began in self._began:
+            timeline.end(self._name, began)
         if self._ranges is not None:
             self._ranges.close()
 
@@ -136,10 +136,10 @@ class _Span(NamedTuple):
     marks: tuple[torch.cuda.Event, torch.cuda.Event] | None  # begin and end on the device
 
 
-class Trace:
+class Timeline:
     """Records the stages of all threads while it is open:
 
-    with gv.Trace("frames.json"):
+    with gv.Timeline("frames.json"):
         engine.render(camera, shader)
 
     The names are those of `FrameStats.stages`. On CUDA a stage appears twice: when the host issued
@@ -157,31 +157,31 @@ class Trace:
             ValueError: The path ends differently, or there is no such device.
             FileNotFoundError: The folder does not exist.
         """
-        self._path, self._device = Path(path), check.device("Trace", device)
+        self._path, self._device = Path(path), check.device("Timeline", device)
         if self._path.suffix != ".json":
-            raise ValueError(f"Trace: path must end in .json, got {str(path)!r}")
+            raise ValueError(f"Timeline: path must end in .json, got {str(path)!r}")
         if not self._path.parent.is_dir():
-            raise FileNotFoundError(f"Trace: folder not found: {self._path.parent}")
+            raise FileNotFoundError(f"Timeline: folder not found: {self._path.parent}")
         self._spans: list[_Span] = []
         self._counts: list[tuple[str, int, dict[str, float]]] = []
         self._tracks: dict[int, tuple[int, str]] = {}  # number and name, by thread
         self._lock = threading.Lock()
 
     def __repr__(self) -> str:
-        return f"Trace({str(self._path)!r}, {len(self._spans)} stages)"
+        return f"Timeline({str(self._path)!r}, {len(self._spans)} stages)"
 
-    def __enter__(self) -> Trace:
+    def __enter__(self) -> Timeline:
         """Starts recording."""
         self._start_ns = time.perf_counter_ns()
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)
             self._start_ns, self._start_event = time.perf_counter_ns(), self._event()
-        _traces.append(self)
+        _timelines.append(self)
         return self
 
     def __exit__(self, *_error: object) -> None:
         """Stops recording and writes the file."""
-        _traces.remove(self)
+        _timelines.remove(self)
         with whole_file(self._path) as draft, draft.open("w", encoding="utf-8") as file:
             json.dump({"traceEvents": self._events(), "displayTimeUnit": "ms"}, file)
 

@@ -77,7 +77,7 @@ class Fly:
     annotation: tyro.conf.OmitArgPrefixes[Annotations] = Annotations()
 
     def run(self) -> None:
-        from ..base.stage import Trace, stage
+        from ..base.stage import Timeline, stage
         from ..cameras import write_cameras
         from ..pictures import Video
 
@@ -90,7 +90,7 @@ class Fly:
         self._check_poses()
         with ExitStack() as stack:
             if self.trace is not None:
-                stack.enter_context(Trace(self.trace, look.device()))
+                stack.enter_context(Timeline(self.trace, look.device()))
             bar = stack.enter_context(Bar())
             is_film = self.output.suffix in _FILM_SUFFIXES
             film = Video(self.output, width, height, fps=fps) if is_film else None

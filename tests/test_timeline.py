@@ -29,7 +29,7 @@ def test_times_and_nesting_are_those_of_the_stages(tmp_path):
         with stage("other"):
             time.sleep(0.02)
 
-    with gv.Trace(path) as trace:
+    with gv.Timeline(path) as trace:
         with stage("outer"):
             with stage("inner"):
                 time.sleep(0.03)
@@ -51,11 +51,11 @@ def test_times_and_nesting_are_those_of_the_stages(tmp_path):
     names = {e["tid"]: e["args"]["name"] for e in content if e["ph"] == "M"}
     assert names[by_name["other"]["tid"]] == "host: reader"
     (count,) = (e for e in content if e["ph"] == "C")
-    assert count["args"] == {"loaded": 7} and not stages._traces
+    assert count["args"] == {"loaded": 7} and not stages._timelines
 
 
 def test_a_trace_is_written_after_a_mistake_too(tmp_path):
-    with pytest.raises(ZeroDivisionError), gv.Trace(tmp_path / "t.json"), stage("broken"):
+    with pytest.raises(ZeroDivisionError), gv.Timeline(tmp_path / "t.json"), stage("broken"):
         raise ZeroDivisionError
     assert [e["name"] for e in spans(tmp_path / "t.json")] == ["broken"]
     with stage("after"):
@@ -67,7 +67,7 @@ def test_a_trace_is_written_after_a_mistake_too(tmp_path):
 )
 def test_bad_paths_are_named(tmp_path, path, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        gv.Trace(tmp_path / path)
+        gv.Timeline(tmp_path / path)
 
 
 @pytest.mark.backend("cpp")
@@ -99,7 +99,7 @@ def test_pictures_are_the_same_while_traced(blobs, tmp_path):
     shader, camera = gv.TransferFunction.preset("gray", 0, 1), gv.Camera.orbit(width=16, height=12)
     tree = gv.N3Tree.from_volume(blobs)
     plain = gv.render(tree, camera, shader)
-    with gv.Trace(tmp_path / "t.json"):
+    with gv.Timeline(tmp_path / "t.json"):
         traced = gv.render(tree, camera, shader)
     assert torch.equal(plain.color, traced.color) and set(traced.stats.stages) == set(
         plain.stats.stages
@@ -137,7 +137,7 @@ def test_the_device_has_a_track_of_its_own(blobs, tmp_path):
     tree = gv.N3Tree.from_volume(blobs, device="cuda")
     shader, camera = gv.TransferFunction.preset("gray", 0, 1), gv.Camera.orbit(width=64, height=48)
     gv.render(tree, camera, shader)
-    with gv.Trace(tmp_path / "t.json", device="cuda"):
+    with gv.Timeline(tmp_path / "t.json", device="cuda"):
         gv.render(tree, camera, shader)
     traces = [e for e in spans(tmp_path / "t.json") if e["name"] == "trace"]
     assert {e["tid"] == 0 for e in traces} == {True, False}
