@@ -6,13 +6,11 @@ that only loads TorchScript archives or exported programs imports `gvtorch.ops`,
 ops.
 """
 
-import ast
 import importlib
 import os
 import sys
-from pathlib import Path
 
-from .base.declared import declared_names
+from .base.declared import imported_names
 
 __version__ = "0.1.0"
 
@@ -22,13 +20,7 @@ if "torch" not in sys.modules and not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & se
     os.environ["GOMP_SPINCOUNT"] = "2000"
 
 #: Public name -> the module that defines it; empty for a subpackage.
-_HOME: dict[str, str] = {}
-for _node in ast.parse(Path(__file__).with_name("__init__.pyi").read_text("utf-8")).body:
-    if isinstance(_node, ast.ImportFrom):
-        _module, _names = _node.module or "", [alias.name for alias in _node.names]
-        if _names == ["*"]:
-            _names = declared_names(_module, "__all__")
-        _HOME |= dict.fromkeys(_names, _module)
+_HOME = imported_names("__init__.pyi")
 __all__ = sorted(_HOME)  # noqa: PLE0605
 
 

@@ -17,8 +17,7 @@ from helpers.waits import nobody_waits
 import gvtorch as gv
 from gvtorch.base import constants as config
 from gvtorch.ops import unavailable
-from gvtorch.pool import BrickTable, Staging, TableRows
-from gvtorch.pool.staging import wide_rows
+from gvtorch.pool.staging import BrickTable, Staging, TableRows, wide_rows
 
 
 def landed(result, channel="value") -> torch.Tensor:

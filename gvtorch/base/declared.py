@@ -1,4 +1,4 @@
-"""`declared_names` and `declared_texts`: names and texts that a module declares, read without
+"""`declared_names`, `declared_texts` and `imported_names`: what a module declares, read without
 importing it, so that `gvtorch --help` does not wait for torch. `did_you_mean`: suggestions for a
 misspelt name.
 """
@@ -27,6 +27,25 @@ def declared_names(module: str, variable: str) -> list[str]:
 def declared_texts(module: str, variable: str) -> dict[str, str]:
     """Returns the dict of strings that a module assigns to a variable, likewise."""
     return ast.literal_eval(_assigned(module, variable))
+
+
+def imported_names(path: str, room: str = "") -> dict[str, str]:
+    """Returns the names that a file of the package, in a room, imports from its neighbours, each
+    with the module that it comes from. `*` stands for the names that a room's `__init__.py`
+    imports, or for the `__all__` of a module.
+    """
+    homes: dict[str, str] = {}
+    for node in ast.parse(_PACKAGE.joinpath(room, path).read_text("utf-8")).body:
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        home = ".".join(filter(None, (room, node.module)))
+        if [alias.name for alias in node.names] != ["*"]:
+            homes |= {alias.name: home for alias in node.names}
+        elif _PACKAGE.joinpath(home).is_dir():
+            homes |= imported_names("__init__.py", home)
+        else:
+            homes |= dict.fromkeys(declared_names(home, "__all__"), home)
+    return homes
 
 
 @functools.cache

@@ -1,6 +1,9 @@
 """The cache: pools with an order of use, requests, and the choice of those that are served."""
 
-from .cache import LRU, Cache
-from .requests import KINDS, RequestList, Requests, RequestsByKind, Scheduler
-
-__all__ = ["KINDS", "LRU", "Cache", "RequestList", "Requests", "RequestsByKind", "Scheduler"]
+from .cache import LRU as LRU
+from .cache import Cache as Cache
+from .requests import KINDS as KINDS
+from .requests import RequestList as RequestList
+from .requests import Requests as Requests
+from .requests import RequestsByKind as RequestsByKind
+from .requests import Scheduler as Scheduler

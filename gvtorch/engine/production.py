@@ -21,8 +21,7 @@ from ..base.stage import stage
 from ..cache import KINDS, Cache, RequestList, Scheduler, write
 from ..cache.requests import Requests, coarser_requests, extra_levels, levels_wanted, requests_below
 from ..cache.write import Targets, Written
-from ..pool import Staging
-from ..pool.staging import SentBricks, upload
+from ..pool.staging import SentBricks, Staging, upload
 from ..producers import Bricks, Region, Regions
 from . import parents
 from .request_batch import (

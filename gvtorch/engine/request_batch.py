@@ -17,8 +17,8 @@ from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
 from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
-from ..pool import N3Tree, Staging, TableRows
-from ..pool.staging import SentBricks, on_host, upload
+from ..pool import N3Tree
+from ..pool.staging import SentBricks, Staging, TableRows, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
 

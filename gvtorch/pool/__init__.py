@@ -1,7 +1,7 @@
 """Node pool, brick pool, the tree over them, and the transfer of bricks to the device."""
 
-from .n3tree import N3Tree
-from .pools import BrickPool, Channel, NodePool
-from .staging import BrickTable, Staging, TableRows
-
-__all__ = ["BrickPool", "BrickTable", "Channel", "N3Tree", "NodePool", "Staging", "TableRows"]
+from .n3tree import N3Tree as N3Tree
+from .pools import BrickPool as BrickPool
+from .pools import Channel as Channel
+from .pools import NodePool as NodePool
+from .staging import BrickTable as BrickTable

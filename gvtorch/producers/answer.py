@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..pool import Channel, TableRows
+from ..pool import Channel
 from ..pool.pyramid import NodeSummary, constant_and_empty
-from ..pool.staging import on_device, on_host, upload
+from ..pool.staging import TableRows, on_device, on_host, upload
 from .producer import Bricks, Nodes, Producer, Region, Regions
 
 Form = TypeVar("Form", bound=Regions | Bricks)
