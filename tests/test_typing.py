@@ -13,6 +13,10 @@ import tomllib
 import pytest
 from helpers import ROOT
 
+import gvtorch as gv
+from gvtorch.cameras import camera
+from gvtorch.shaders import built_in
+
 USE = """
 import gvtorch as gv
 import torch
@@ -51,3 +55,11 @@ def test_an_editable_install_is_a_path():
     """setuptools writes a path if the folder of packages is specified, else an import hook."""
     tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
     assert tool["package-dir"] == {"": "."} and (ROOT / "gvtorch" / "py.typed").is_file()
+
+
+def test_every_public_name_is_there():
+    """`*` in `__init__.pyi` stands for what rooms hand on, and for the `__all__` of a module."""
+    values = {name: getattr(gv, name) for name in gv.__all__}
+    assert {"Camera", "Engine", "Isosurface", "N3Tree", "render", "sdf"} <= set(values)
+    assert values["Lit"] is built_in.Lit and values["Camera"] is camera.Camera
+    assert not [name for name in values if name.startswith("_") or name not in dir(gv)]
