@@ -40,9 +40,18 @@ def quick_compiler(folder: Path, *first_lines: str, compiler: str | None = None)
     return str(file)
 
 
+def _links_by_gold(folder: Path) -> bool:
+    """Returns whether the C++ compiler links a library by gold that uses the standard library."""
+    source, library = folder / "trial.cpp", folder / "trial.so"
+    source.write_text("#include <string>\nstd::string text(int n) { return std::to_string(n); }\n")
+    command = [*compilers.find_cxx(), "-fPIC", "-shared", "-Wl,-z,defs", "-fuse-ld=gold"]
+    run = subprocess.run([*command, source, "-o", library], capture_output=True, check=False)
+    return run.returncode == 0
+
+
 def prepared_compiler(folder: Path) -> str:
     """Writes a quick compiler with precompiled headers and, if there is one, a quick linker."""
-    linker = "-fuse-ld=gold" if shutil.which("ld.gold") else ""
+    linker = "-fuse-ld=gold" if _links_by_gold(folder) else ""
     prefix = folder / "gv_prefix.h"
     prefix.write_text(PREFIX)
     # A header of the system's is not listed as one that the shader depends on.
