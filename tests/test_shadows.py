@@ -191,6 +191,22 @@ def test_a_headlight_and_no_light_at_all_throw_no_shadow(backend):
     assert torch.equal(plain.samples, shadowed.samples)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rays_do_not_depend_on_those_whose_cones_are_traced_with_theirs(compiled, dtype):
+    """Packets and warps gather the cones of their rays, of which there may be any number."""
+    value = fog(6)
+    tree = tree_of(value, compiled)
+    transfer = gv.TransferFunction([(0.2, 0), (1, 0.08)])
+    shader = gv.Lit(transfer, normals="none", light=LAMP, shadows=True)
+    rays = rays_through(box_of(value.shape, SPACING, ORIGIN), DEVICES[compiled], 70)
+    together = vars(gv.trace(tree, rays, shader, step=0.4, dtype=dtype, backend=compiled))
+    assert float(together["alpha"].min()) < 0.9 and int(together["samples"].min()) > 200
+    for part in (slice(1), slice(5, 38), slice(3, 70, 2), slice(64, 70)):
+        alone = gv.trace(tree, rays[part], shader, step=0.4, dtype=dtype, backend=compiled)
+        for name, values in vars(alone).items():
+            assert values is None or torch.equal(values, together[name][part]), name
+
+
 def test_a_surface_has_no_shadows_per_sample():
     surface = gv.Isosurface(0.5)
     surface.shadows = True

@@ -312,8 +312,8 @@ struct PacketWalk : PacketPath {
       auto lane_intervals = take_lane<Intervals<float>>(intervals, lane);
       const Extent<float> lane_extent{extent.exit[lane], extent.cone_low[lane], extent.cone_high[lane]};
       auto&& lane_sum = sum_of<Sum>(sum, lane);
-      const auto add_lit = [&](const auto&, const Piece<float>& piece, const LitPoint<float>& point,
-                               const LightCone<float>& cone, int32_t&) {
+      const auto add_lit = [&](const Piece<float>& piece, const LitPoint<float>& point, const LightCone<float>& cone,
+                               int32_t&) {
         if constexpr (kShadowed) {
           if (shadows.is_full()) {  // adding changes this lane's sum too
             put_lane(sum, lane, lane_sum);

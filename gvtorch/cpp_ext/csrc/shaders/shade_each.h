@@ -24,6 +24,10 @@ torch::stable::Tensor allocate_node_cache(const torch::stable::Tensor& like, int
   return node_cache;
 }
 
+#ifdef __CUDACC__
+static_assert(kBlockThreads == kBlockWarps * kWarpThreads);
+#endif
+
 template <class Kernel>
 void shade_each(const torch::stable::Tensor& like, int64_t nodes, Kernel kernel) {
   const torch::stable::Tensor node_cache = allocate_node_cache(like, nodes, kernel);

@@ -11,6 +11,7 @@
 #include <type_traits>
 
 #include "shaders/shaders.h"
+#include "shaders/warp_shadows.h"
 
 namespace gvtorch::GV_NAMESPACE {
 
@@ -58,26 +59,43 @@ struct ShadeRay : Walk<T> {
 
   GV_HD void operator()(int64_t index) const {
     const int64_t number = this->order(index);
+#ifdef __CUDA_ARCH__
+    const unsigned lanes = kShadows ? __ballot_sync(__activemask(), number >= 0) : 0;
+#endif
     if (number < 0) return;
     const Ray<T> ray(this->rays, number);
     const Sight<T> sight(this->rays, number, ray.moved);
     Intervals<T> intervals(ray, step, lengths);
     Sum sum = first_sum(number);
     const auto& ready = ready_for_ray(shader);
-    const auto add_lit = [&](const auto& probe, const Piece<T>& piece, const LitPoint<T>& point,
-                             const LightCone<T>& cone, int32_t& samples) {
-      const T share = light.receives(point) ? light_share(ray, probe, cone, samples, sum.missed) : static_cast<T>(1);
-      sum.add(light.in_shadow(point, share), piece);
+    const auto trace_ray = [&](const auto& add_lit) {
+      Visitor<std::decay_t<decltype(ready)>, std::decay_t<decltype(add_lit)>> visitor{
+          *this, ready, &sight, sum, this->stop_clear, add_lit};
+      this->template follow<Digits>(ray, intervals, visitor);
+      return visitor.samples;
     };
-    Visitor<std::decay_t<decltype(ready)>, std::decay_t<decltype(add_lit)>> visitor{
-        *this, ready, &sight, sum, this->stop_clear, add_lit};
-    this->template follow<Digits>(ray, intervals, visitor);
-    if constexpr (Shader::kSurface) {
-      if (sum.depth < static_cast<T>(INFINITY)) {
-        surface<Digits>(ray, sight, sum);
-      }
+    int32_t samples;
+#ifdef __CUDA_ARCH__
+    if constexpr (kShadows) {
+      WarpShadows<T, ShadeRay> shadows(*this, ray, sight, lanes);
+      samples = trace_ray([&](const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone,
+                              int32_t& ray_samples) { shadows.add(piece, point, cone, sum, ray_samples); });
+      shadows.finish(sum, samples);
+    } else {
+      samples = trace_ray(nullptr);
     }
-    finish(number, ray.moved, visitor.samples, sum);
+#else
+    samples =
+        trace_ray([&](const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone, int32_t& ray_samples) {
+          const T share =
+              light.receives(point) ? light_share(ray, sight, cone, ray_samples, sum.missed) : static_cast<T>(1);
+          sum.add(light.in_shadow(point, share), piece);
+        });
+#endif
+    if constexpr (Shader::kSurface) {
+      if (sum.depth < static_cast<T>(INFINITY)) surface<Digits>(ray, sight, sum);
+    }
+    finish(number, ray.moved, samples, sum);
   }
 
   // The sum of a ray before its first interval.
@@ -161,7 +179,26 @@ struct ShadeRay : Walk<T> {
     return channels.normal.exists() && light.kind() == LightKind::kPoint;  // from a direction that varies
   }
 
-  // See Walk::follow. AnyShader: as above. AddLit: adds an interval with its shadow, add_lit(probe, piece, point, cone,
+  // Share of the light that reaches the position at the tip of a cone. The cone begins as wide as the ray's is there;
+  // its first interval is left out, so that a position does not shadow itself.
+  GV_HD T light_share(const Ray<T>& ray, const Sight<T>& sight, const LightCone<T>& cone, int32_t& samples,
+                      bool& missed) const {
+    const RayView& rays = this->rays;
+    const Vec3<double> position = ray.along(cone.t, Digits::kDeep && rays.deep);
+    const Ray<T> beam(rays, position, cone.direction, ray.cone(cone.t), cone.growth, cone.length);
+    const Sight<T> eye(sight.at(cone.t), cone.direction);
+    Intervals<T> intervals(beam, step, lengths);
+    intervals.move_to(true, intervals.count + 1);
+    const ShadowShader<T, Shader> shadow_shader{{}, shader};
+    typename ShadowShader<T, Shader>::Sum sum;
+    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &eye, sum, light.faintest(this->stop_clear)};
+    this->template follow<Digits>(beam, intervals, visitor);
+    samples += visitor.samples;
+    missed = missed || sum.missed;
+    return sum.clear;
+  }
+
+  // See Walk::follow. AnyShader: as above. AddLit: adds an interval with its shadow, add_lit(piece, point, cone,
   // samples); called only with kShadows.
   template <class AnyShader, class AddLit = std::nullptr_t>
   struct Visitor {
@@ -262,33 +299,13 @@ struct ShadeRay : Walk<T> {
     GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
       if constexpr (kShadows && !kToLight) {
         active_shader.add(true, piece, probe, sum, [&](bool, const LitPoint<T>& point, const LightCone<T>& cone) {
-          add_lit(probe, piece, point, cone, samples);
+          add_lit(piece, point, cone, samples);
         });
       } else {
         active_shader.add(true, piece, probe, sum);
       }
     }
   };
-
- private:
-  // Share of the light that reaches the position at the tip of a cone. The cone begins as wide as the ray's is there;
-  // its first interval is left out, so that a position does not shadow itself.
-  GV_HD T light_share(const Ray<T>& ray, const Probe<T>& probe, const LightCone<T>& cone, int32_t& samples,
-                      bool& missed) const {
-    const RayView& rays = this->rays;
-    const Vec3<double> position = ray.along(cone.t, Digits::kDeep && rays.deep);
-    const Ray<T> beam(rays, position, cone.direction, ray.cone(cone.t), cone.growth, cone.length);
-    const Sight<T> sight(probe.sight.at(cone.t), cone.direction);
-    Intervals<T> intervals(beam, step, lengths);
-    intervals.move_to(true, intervals.count + 1);
-    const ShadowShader<T, Shader> shadow_shader{{}, shader};
-    typename ShadowShader<T, Shader>::Sum sum;
-    Visitor<ShadowShader<T, Shader>> visitor{*this, shadow_shader, &sight, sum, light.faintest(this->stop_clear)};
-    this->template follow<Digits>(beam, intervals, visitor);
-    samples += visitor.samples;
-    missed = missed || sum.missed;
-    return sum.clear;
-  }
 };
 
 // Computes the words of a node, with what a shader with kHidesAlike hides.
