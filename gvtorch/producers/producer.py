@@ -59,6 +59,7 @@ def _interpolate(bricks: Tensor, row: Tensor, position: Tensor) -> Tensor:
     """Returns (p, c) float32 values, interpolated trilinearly at `position` (p, 3), in
     voxels, in the bricks with indices `row` (p,) among `bricks` (k, z, y, x, c).
     """
+    position = position.clamp(0, bricks.shape[1] - 1)  # bricks without a border end there
     low = position.floor().clamp(max=bricks.shape[1] - 2)
     fraction, low = (position - low).to(torch.float32), low.to(torch.int64)
     values = bricks.new_zeros((len(row), bricks.shape[-1]), dtype=torch.float32)
@@ -395,7 +396,8 @@ class Producer(torch.nn.Module):
         position = (points.reshape(-1, 3).to(layout.origin_3) - layout.origin_3) / layout.spacing_3
         position = torch.minimum(position.clamp(min=0), layout.extent_3 - 1)  # in voxels
         depth = torch.full_like(position[:, :1], layout.depth)
-        node_loc = torch.cat(((position / layout.brick_size).floor(), depth), 1).to(torch.int64)
+        node = ((position + 0.5) / layout.brick_size).floor()
+        node_loc = torch.cat((node, depth), 1).to(torch.int64)
         loc, row = distinct_rows(node_loc)
         bricks_of = self.bricks_at(loc, layout)
         brick_position = position - node_loc[:, :3] * layout.brick_size + layout.border
