@@ -395,12 +395,14 @@ def json_file(kind: str, path: str | Path) -> Any:
 
 
 def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
-    """Returns a float64 CPU tensor; ValueError unless finite and of `shape`, if that is given."""
+    """Returns a float64 CPU tensor, which is a copy; ValueError unless finite and of `shape`, if
+    that is given.
+    """
     no_gradient(context, name, value)
     if _is_complex(value):
         raise ValueError(f"{context}: {name} must be real numbers, got {quoted(value)}")
     try:
-        numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+        numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{context}: {name} must be numbers, got {quoted(value)}") from None
     if shape is not None and numbers.shape != shape:

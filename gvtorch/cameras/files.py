@@ -220,17 +220,23 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
         x, y = (int(fields.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
         if not x or not y:
             raise ValueError("does not give the size of the pictures: give width and height")
-        fx = (
-            fields["fl_x"] if "fl_x" in fields else 0.5 * x / math.tan(fields["camera_angle_x"] / 2)
-        )
-        fy = fields.get("fl_y", fx)
+        if (fx := _focal_length(fields, "x", x)) is None:
+            raise KeyError("camera_angle_x")
+        fy = _focal_length(fields, "y", y) or fx
         cx, cy = fields.get("cx", x / 2), fields.get("cy", y / 2)
         name = str(fields.get("file_path", f"{number:04d}.png"))
         if name in cameras:
             raise ValueError(f"frame {number}: there is one of {name!r} already")
-        model = fields.get("camera_model", "PINHOLE")
+        is_fisheye = fields.get("is_fisheye")  # as instant-ngp says it
+        model = _FISHEYE if is_fisheye else fields.get("camera_model", "PINHOLE")
         cameras[name] = _camera_of_lens(model, view, (fx, fy, cx, cy), fields, (x, y))
     return cameras
+
+
+def _focal_length(fields: Mapping[str, Any], axis: str, size: int) -> Any:
+    """Returns pixels, from the length or the field of view of an axis; None if there is neither."""
+    angle = fields.get(f"camera_angle_{axis}")
+    return fields.get(f"fl_{axis}", angle and 0.5 * size / math.tan(angle / 2))
 
 
 def _camera_of_lens(

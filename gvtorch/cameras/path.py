@@ -1,7 +1,7 @@
 """`CameraPath`: a camera that moves, from key frames.
 
 Positions, targets and fields of view run along Catmull-Rom curves, which pass through every key and
-have no corners. Source: Catmull and Rom, "A class of local interpolating splines", 1974.
+have no corners; fields of view stay between the smallest and the largest of the keys. Source: Catmull and Rom, "A class of local interpolating splines", 1974.
 """
 
 from __future__ import annotations
@@ -162,7 +162,8 @@ class CameraPath:
         a, b, c, d = self._keys[index]
         # Cubic through b and c, with the slope at each that of the chord between its neighbours.
         key = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
-        eye, target, up, fov = key[:3], key[3:6], key[6:9], float(key[9])
+        fov = float(key[9].clamp(*self._keys[:, 9].aminmax()))
+        eye, target, up = key[:3], key[3:6], key[6:9]
         return Camera.look_at(eye, target, up, fov, width, height, model)
 
 
