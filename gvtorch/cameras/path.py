@@ -1,7 +1,8 @@
 """`CameraPath`: a camera that moves, from key frames.
 
 Positions, targets and fields of view run along Catmull-Rom curves, which pass through every key and
-have no corners; fields of view stay between the smallest and the largest of the keys. Source: Catmull and Rom, "A class of local interpolating splines", 1974.
+have no corners; fields of view stay between the smallest and the largest of the keys. Source:
+Catmull and Rom, "A class of local interpolating splines", 1974.
 """
 
 from __future__ import annotations

@@ -124,10 +124,9 @@ class _LoopingFilm:
 
         self._image: Any = Image
         self._suffix, self._fps = suffix, fps
-        self._frames: list[Any] = []
 
     def open(self, part: Path) -> None:
-        self._part = part
+        self._part, self._frames = part, list[Any]()
 
     def add(self, pixels: np.ndarray) -> None:
         self._frames.append(self._image.fromarray(pixels))
