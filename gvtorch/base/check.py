@@ -17,6 +17,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -392,6 +393,16 @@ def json_file(kind: str, path: str | Path) -> Any:
         return json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{file}: not a JSON file: {one_line(error)}") from None
+
+
+def real_array(value: Any) -> np.ndarray:
+    """Returns numbers of any shape as an array, which may share their memory; TypeError or
+    ValueError for text, complex numbers, masked ones and anything else.
+    """
+    array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    if array.dtype.kind not in "biuf" or np.ma.is_masked(value):
+        raise TypeError
+    return array
 
 
 def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:

@@ -38,8 +38,9 @@ class Material:
 class Mesh:
     """Triangles, with colours and texture coordinates for each of their corners.
 
-    Raises ValueError if a field has the wrong shape, an index is out of range, a position is not
-    finite, or there is no triangle.
+    Arrays of these dtypes are not copied, so they must not be changed afterwards. Raises ValueError
+    if a field has the wrong shape, an index is out of range, a position is not finite, or there is
+    no triangle.
     """
 
     vertices: np.ndarray  # (v, 3) float64, world units, x y z
@@ -65,8 +66,9 @@ class Mesh:
                 continue
             shape = (None if field_name == "vertices" else count, *row_shape)
             expected_shape = ", ".join("n" if n is None else str(n) for n in shape)
+            check.no_gradient(self.name, field_name, value)
             try:
-                array = np.asarray(value)
+                array = check.real_array(value)
                 is_whole = dtype != np.int64 or (array == np.trunc(array)).all()
                 with np.errstate(invalid="ignore"):
                     value = np.ascontiguousarray(array, dtype)
