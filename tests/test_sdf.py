@@ -96,6 +96,27 @@ def test_values_are_those_of_numpy(named):
     assert single.dtype == torch.float32 and np.abs(single.numpy() - expected).max() < 2e-6
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: sdf.Repeat(
+            sdf.Transform(block(), ((0.5, 0.3, 0), (0, 0.4, 0.2), (0, 0, 0.3))), (2, 2, 0)
+        ),
+        lambda: sdf.Repeat(sdf.Box() & sdf.Plane((1, 1, 1), -0.3), (1, 0, 0)),
+        lambda: sdf.Repeat(sdf.Box() - sdf.Plane((-1, -1, 0), 0.3), (0, 1, 0), (1, 3, 1)),
+    ],
+)
+@pytest.mark.parametrize("by", [0.0, 0.2])
+def test_intervals_of_repeated_shapes_hold_where_cells_change(make, by):
+    """A value that is no distance may be less at the next but one copy, and jumps there."""
+    shape = sdf.Offset(make(), by)
+    center, half = random_boxes(BOXES // 10)
+    low, high = shape.bounds(center, half)
+    value = shape(points_inside(center, half, 27))
+    assert (value >= low[:, None] - 1e-12).all() and (value <= high[:, None] + 1e-12).all()
+    assert ((low > 0) | (high < 0)).double().mean() > 0.15, "and they say something"
+
+
 def test_intervals_hold_in_random_boxes(shape):
     """10^5 boxes: no value at 27 points of each is outside, and no slope is exceeded."""
     center, half = random_boxes(BOXES)

@@ -236,6 +236,23 @@ class Repeat(Space):
             value = torch.minimum(value, other)
         return value, color
 
+    def slope(self, center: Tensor, half: Tensor) -> Tensor:
+        """Returns a huge slope for boxes in which the two nearest cells change: there the value
+        jumps, unless it is a distance, which no other copy can be nearer than.
+        """
+        slope, parts = super().slope(center, half), self.shape.modules()
+        if self.shape.exact and not any(isinstance(part, Intersection) for part in parts):
+            return slope
+        for axis in self._axes:
+            first, last = (
+                (end[:, axis] / self.period[axis])
+                .floor()
+                .clamp(-self._max_cell[axis] - 1, self._max_cell[axis])
+                for end in (center - half, center + half)
+            )
+            slope = torch.where(first < last, 1e30, slope)
+        return slope
+
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
         """Returns boxes (k, 3) that hold the results of `_cells` for all points of boxes."""
         low, high = center - half, center + half
