@@ -224,6 +224,15 @@ def test_a_path_around_a_box_keeps_it_whole_and_its_distance(model, up):
     assert (eyes[:, axis] - eyes[0, axis]).abs().max() < 1e-9
 
 
+@pytest.mark.parametrize("elevation", [90, -90, 40])
+def test_a_path_turns_around_a_box_above_and_below_it_too(elevation):
+    path = gv.CameraPath.orbit(BOX, elevation=elevation)
+    for key in (0, 9, 20, 36):
+        orbit = gv.Camera.orbit(30 + 10 * key, elevation, width=8, height=8).placed(BOX)
+        camera = path.camera(key / 36, 8, 8)
+        torch.testing.assert_close(camera.viewmats, orbit.viewmats, atol=1e-6, rtol=0)
+
+
 def test_a_path_keeps_its_fields_of_view_between_those_of_the_keys():
     path = gv.CameraPath([(0, 0, 5)] * 4, [(0, 0, 0)] * 4, fov=[5, 5, 90, 90])
     fovs = []

@@ -7,6 +7,7 @@ Catmull and Rom, "A class of local interpolating splines", 1974.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -104,8 +105,10 @@ class CameraPath:
         cameras = Camera.orbit(azimuths, elevation, distance, width=1, height=1, up=up).placed(box)
         eye = _eye_positions(cameras)
         center = box.mean(0).expand_as(eye)
-        ups = [upward(context, up).tolist()] * len(eye)
-        return cls(eye.tolist(), center.tolist(), ups, [fov] * len(eye))
+        ups = upward(context, up).expand_as(eye)
+        if abs(math.cos(math.radians(elevation))) < 1e-9:  # at a pole `up` leads nowhere
+            ups = -cameras.viewmats[:, 1, :3]
+        return cls(eye.tolist(), center.tolist(), ups.tolist(), [fov] * len(eye))
 
     @classmethod
     def from_json(
