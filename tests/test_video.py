@@ -75,6 +75,9 @@ def test_mp4(tmp_path):
     with av.open(str(tmp_path / "a.mp4")) as file:
         decoded = [frame.to_ndarray(format="rgb24").astype(int) for frame in file.decode(video=0)]
         assert file.streams.video[0].average_rate == 12
+        codec = file.streams.video[0].codec_context
+        tags = codec.color_primaries, codec.color_trc, codec.colorspace, codec.color_range
+        assert tags == (1, 13, 6, 1), "players decode what was encoded, whatever its size"
     assert len(decoded) == 6
     for frame, other in zip(decoded, expected, strict=True):
         assert np.abs(frame - other).mean() < 12
