@@ -311,14 +311,17 @@ class Producer(torch.nn.Module):
                 have changed, themselves or anything below them. Left out: everything.
 
         Raises:
-            ValueError: Corners are not finite, or of another shape.
+            ValueError: Corners are not finite, of another shape, or the low one is not below.
         """
         if where is not None and not callable(where):
-            boxes = check.reals(f"{type(self).__name__}.changed", "where", where)
+            context = f"{type(self).__name__}.changed"
+            boxes = check.reals(context, "where", where)
             if boxes.dim() not in (2, 3) or boxes.shape[-2:] != (2, 3):
+                got = check.as_text(boxes)
+                raise ValueError(f"{context}: where must be (2, 3) or (m, 2, 3) corners, got {got}")
+            if not bool((boxes[..., 0, :] <= boxes[..., 1, :]).all()):
                 raise ValueError(
-                    f"{type(self).__name__}.changed: where must be (2, 3) or (m, 2, 3) corners, "
-                    f"got {check.as_text(boxes)}"
+                    f"{context}: where must be low and high corners, got {boxes.tolist()}"
                 )
             where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
         self.version = next(_version_numbers)
