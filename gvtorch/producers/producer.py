@@ -255,10 +255,7 @@ class Producer(torch.nn.Module):
                 raise ValueError(f"{context}: {argument} must be a dict by channel, got a {kind}")
         self.channels = dict(channels) if channels is not None else {"value": Channel()}
         for name, channel in self.channels.items():
-            if not isinstance(channel, Channel):
-                raise ValueError(
-                    f"{context}: channels[{name!r}] must be a Channel, got {channel!r}"
-                )
+            check.instance(context, f"channels[{name!r}]", channel, Channel)
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         for argument, by_channel in (("value_range", self.value_range), ("labels", self.labels)):
             if unknown := sorted(map(str, {*by_channel} - {*self.channels})):
