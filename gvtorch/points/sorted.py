@@ -316,10 +316,8 @@ class _Sorter:
         table = Table(self.folder, name)
         for rows in grouped(counted, {**_SUMS_AND_BOUNDS, "rows": np.add.reduceat}, divide):
             count = rows.pop("rows")
-            rows_below, max_rows = (
-                rows_below + int(count.sum()),
-                max(max_rows, int(count.max(initial=0))),
-            )
+            rows_below += int(count.sum())
+            max_rows = max(max_rows, int(count.max(initial=0)))
             if len(count):
                 table.append(rows)
         return table, 0 < 2 * len(table) <= rows_below or max_rows > _ROWS_WORTH_STORING
