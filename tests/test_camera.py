@@ -224,6 +224,33 @@ def test_a_path_around_a_box_keeps_it_whole_and_its_distance(model, up):
     assert (eyes[:, axis] - eyes[0, axis]).abs().max() < 1e-9
 
 
+@pytest.mark.parametrize("elevation", [90, -90, 40])
+def test_a_path_turns_around_a_box_above_and_below_it_too(elevation):
+    path = gv.CameraPath.orbit(BOX, elevation=elevation)
+    for key in (0, 9, 20, 36):
+        orbit = gv.Camera.orbit(30 + 10 * key, elevation, width=8, height=8).placed(BOX)
+        camera = path.camera(key / 36, 8, 8)
+        torch.testing.assert_close(camera.viewmats, orbit.viewmats, atol=1e-6, rtol=0)
+
+
+def test_a_path_keeps_its_fields_of_view_between_those_of_the_keys():
+    path = gv.CameraPath([(0, 0, 5)] * 4, [(0, 0, 0)] * 4, fov=[5, 5, 90, 90])
+    fovs = []
+    for at in torch.linspace(0, 1, 31).tolist():
+        fovs.append(2 * math.degrees(math.atan(1 / float(path.camera(at, 2, 2).Ks[0, 1, 1]))))
+    assert min(fovs) == pytest.approx(5) and max(fovs) == pytest.approx(90)
+    assert fovs[15] == pytest.approx(47.5)
+
+
+def test_a_camera_keeps_its_own_numbers():
+    view, K = torch.eye(4).double(), torch.tensor([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]]).double()
+    camera = gv.Camera(view, K, 8, 8)
+    before = camera.rays()
+    view[0, 3], K[0, 0] = 1.0, 1.0
+    assert torch.equal(camera.rays().origin, before.origin)
+    assert torch.equal(camera.rays().direction, before.direction)
+
+
 def test_a_batch_that_fits_has_a_distance_each():
     cameras = gv.Camera.orbit([0, 90], 0, fov=30, fit=True).placed(BOX)
     assert len(cameras) == 2

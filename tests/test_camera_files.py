@@ -132,6 +132,24 @@ def test_a_camera_of_blender_looks_along_its_minus_z(tmp_path):
     assert gv.read_cameras(tmp_path / "t.json", width=100, height=80)["r_0"].width == 100
 
 
+@pytest.mark.parametrize(
+    ("lens", "model", "focal"),
+    [
+        ({"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 2}, "pinhole", (50, 40)),
+        ({"camera_angle_x": math.pi / 2, "fl_y": 45.0}, "pinhole", (50, 45)),
+        ({"fl_x": 60.0, "camera_angle_x": 1.0}, "pinhole", (60, 60)),
+        ({"fl_x": 60.0, "is_fisheye": True, "k1": 0.1}, "fisheye", (60, 60)),
+        ({"fl_x": 60.0, "is_fisheye": True, "camera_model": "OPENCV"}, "fisheye", (60, 60)),
+    ],
+)
+def test_lenses_of_instant_ngp(tmp_path, lens, model, focal):
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "t.json").write_text(json.dumps({"w": 100, "h": 80, **lens, "frames": [frame]}))
+    camera = gv.read_cameras(tmp_path / "t.json")["a"]
+    assert camera.model == model and camera.radial_coeffs[0, 0] == lens.get("k1", 0)
+    assert camera.Ks[0, (0, 1), (0, 1)].tolist() == pytest.approx(focal)
+
+
 def test_a_text_model_of_colmap(tmp_path):
     """As documented: q = w x y z, world to camera; a quarter turn around z, by hand."""
     (tmp_path / "cameras.txt").write_text(

@@ -195,7 +195,7 @@ def test_where_it_has_changed_is_known_as_far_as_it_was_told():
     for _ in range(99):
         first.changed(box)
     assert both.changes(version) is None, "too many to remember"
-    for wrong in (box[0], box.flatten(), "here", box + torch.nan):
+    for wrong in (box[0], box.flatten(), "here", box + torch.nan, box.flip(0)):
         with pytest.raises(ValueError, match=r"FieldProducer\.changed: where must be"):
             first.changed(wrong)
 

@@ -290,6 +290,15 @@ def test_producers_of_any_kind_tell_values_at_points(blobs):
         assert engine.trees
 
 
+def test_values_at_points_end_where_bricks_without_a_border_do():
+    ramp = torch.arange(16.0).expand(16, 16, 16).contiguous()
+    producer = gv.VolumeProducer(gv.Volume(ramp * ramp))
+    points = torch.tensor([[3.25, 0, 9], [7.25, 9, 0], [7.75, 0, 0], [15, 3, 3]])
+    with gv.Engine(producer, brick_size=8, border=0):
+        assert producer.at(points)["value"][:, 0].tolist() == [10.75, 49, 64, 225]
+    assert producer.at(points)["value"][:, 0].tolist() == [10.75, 52.75, 60.25, 225]
+
+
 @pytest.mark.parametrize(
     "make",
     [

@@ -266,6 +266,17 @@ def test_nan_of_a_field_costs_its_bricks_alone(dtype):
         )
 
 
+def test_integers_that_are_not_finite_fail_beside_another_channel_too():
+    field = Given(lambda points: points[..., 0].clamp(0, 1))
+    torn = gv.FieldProducer(field, 64, box=BOX, channels={"value": gv.Channel(torch.uint8)})
+    whole = gv.FieldProducer(field, 64, box=BOX)
+    field.function = lambda points: torch.where(points[..., 0] > 0.6, math.nan, 0.5)
+    nodes = nodes_of(torn, 1)
+    alone, joined = torn.fill(nodes), gv.JoinedProducer({"a": torn, "b": whole}).fill(nodes)
+    assert alone.kind.unique().tolist() == [-1, gv.Region.DATA]
+    assert torch.equal(joined.kind, alone.kind)
+
+
 class Bounded(Field):
     """A field that returns the interval it is given."""
 

@@ -137,6 +137,22 @@ def test_forged_pictures_are_refused_in_a_line(tmp_path):
         assert kind == "read" or str(path) in message, message
 
 
+def test_a_volume_is_no_picture_and_planes_of_colour_are(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    planes = np.random.default_rng(0).integers(0, 256, (3, 6, 9), np.uint8)
+    options = {"photometric": "rgb", "planarconfig": "separate"}
+    tifffile.imwrite(tmp_path / "planes.tif", planes, **options)
+    tifffile.imwrite(tmp_path / "pixels.tif", planes.transpose(1, 2, 0), photometric="rgb")
+    pixels, as_planes = (gv.read_image(tmp_path / f"{n}.tif") for n in ("pixels", "planes"))
+    assert pixels.shape == (6, 9, 3) and torch.equal(pixels, as_planes)
+    stack = np.zeros((5, 8, 9), np.uint16)
+    tifffile.imwrite(tmp_path / "stack.tif", stack, photometric="minisblack")
+    np.save(tmp_path / "stack.npy", stack)
+    for name in ("stack.tif", "stack.npy"):
+        with pytest.raises(ValueError, match=r"must hold \(h, w, 3\) numbers, got \(5, 8, 9\)"):
+            gv.read_image(tmp_path / name)
+
+
 def test_floats_of_pictures_beyond_float32_are_infinite_without_a_warning(tmp_path):
     np.save(tmp_path / "a.npy", np.full((2, 2, 3), 1e300))
     assert torch.isinf(gv.read_image(tmp_path / "a.npy")).all()

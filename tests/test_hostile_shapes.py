@@ -89,7 +89,7 @@ def test_integers_of_numpy_are_extents():
         (lambda: triangle(faces=5), "mesh: faces must be (n, 3), got (1,)"),
         (lambda: triangle(faces=[[0, 1, 2], [1]]), "mesh: faces must be (n, 3) numbers"),
         (lambda: triangle(faces=None), "mesh: faces must be (n, 3) numbers"),
-        (lambda: triangle(vertices=None), "mesh: vertices must be (n, 3), got (1,)"),
+        (lambda: triangle(vertices=None), "mesh: vertices must be (n, 3) numbers"),
         (lambda: gv.Material(color=(1, 1)), "material '': color must be (4,) numbers, got (2,)"),
         (lambda: gv.Material(color=(1, 1, 1, math.nan)), "material '': color must be finite"),
         (lambda: gv.Material(texture=np.ones((4, 4, 4))), "texture must be (h, w, 4) uint8, got"),

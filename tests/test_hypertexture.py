@@ -166,6 +166,14 @@ def test_channels_and_places():
     torch.testing.assert_close(values["distance"], right)
 
 
+def test_distances_beyond_halves_are_the_largest_half():
+    shape = gv.sdf.Sphere(3e5)
+    options = {"thickness": 1e5, "frequency": 1e-5, "dtype": torch.float16}
+    producer = rough(64, shape, distances=True, **options)
+    distances = producer.fill(with_data(producer, 0, 8))["distance"]
+    assert distances.isfinite().all() and distances.aminmax() == (-65504, 65504)
+
+
 def test_a_volume_of_distances_stands_for_the_shape():
     axis = torch.linspace(-1.5, 1.5, 61)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")

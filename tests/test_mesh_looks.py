@@ -115,3 +115,6 @@ def test_sizes_beyond_all_numbers_are_told():
         grid = Voxelizer(box, resolution=32)
         covered = grid.region((0, 0, 0), grid.extent[::-1])["coverage"].double().sum() / 255
         assert float(covered) * (grid.spacing / scale) ** 3 == pytest.approx(0.28, rel=0.01)
+        painted = Voxelizer(box, resolution=16, channels=("color", "material"))
+        inside = painted.constants(torch.tensor([True]))
+        assert inside["color"][0].tolist() == pytest.approx([0.8, 0.8, 0.8, 1], abs=1e-3)

@@ -392,6 +392,8 @@ def test_bad_meshes_are_told_in_a_line():
         ({"material": np.full(12, -2)}, "refers to material -2, there are 1"),
         ({"vertices": np.zeros((8, 3))}, "all triangles lie in one point"),
         ({"vertices": np.zeros((8, 2))}, "vertices must be (n, 3)"),
+        ({"vertices": np.ones((8, 3)) * 1j}, "vertices must be (n, 3) numbers"),
+        ({"vertices": np.ma.masked_less(np.zeros((8, 3)), 1)}, "vertices must be (n, 3) numbers"),
         ({"uv": np.zeros((3, 3, 2))}, "uv must be (12, 3, 2)"),
     ):
         fields = {"vertices": box.vertices, "faces": box.faces} | changes

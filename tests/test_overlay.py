@@ -15,7 +15,7 @@ import gvtorch as gv
 from gvtorch.base.records import RenderStats
 from gvtorch.base.units import unit_symbol
 from gvtorch.pictures.files import write_png_rows
-from gvtorch.pictures.overlay import _round_below, _ticks
+from gvtorch.pictures.overlay import _labels, _round_below, _ticks
 
 pytest.importorskip("PIL")
 HOT = gv.TransferFunction.preset("hot", 0, 200)
@@ -109,6 +109,11 @@ def test_ticks_are_few_and_round(low, high, expected):
     steps = np.diff(ticks)
     assert np.allclose(steps, steps[0]) and np.isclose(_round_below(steps[0]), steps[0])
     assert len(ticks) >= expected - 1
+
+
+def test_ticks_that_differ_late_are_told_apart():
+    assert _labels(_ticks(1e6, 1e6 + 2)) == [f"{1e6 + n / 2:.10g}" for n in range(5)]
+    assert _labels(_ticks(0, 1)) == ["0", "0.2", "0.4", "0.6", "0.8", "1"]
 
 
 def test_overlays_blend_in_linear_light_and_are_opaque_where_nothing_was():

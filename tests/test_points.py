@@ -218,6 +218,9 @@ def test_sums_that_halves_cannot_hold_are_told_once():
         (lambda: gv.PointProducer(torch.zeros(0, 3)), r"positions must be (n, 3), n >= 1"),
         (lambda: gv.PointProducer(torch.zeros(4, 2)), r"positions must be (n, 3)"),
         (lambda: gv.PointProducer(torch.full((2, 3), torch.nan)), "positions must be finite"),
+        (lambda: gv.Points([["1", "2", "3"]]), "positions must be numbers"),
+        (lambda: gv.Points(torch.ones((2, 3)) * 1j), "positions must be numbers"),
+        (lambda: gv.Points(np.ma.masked_less(np.eye(3), 1)), "positions must be numbers"),
         (lambda: gv.PointProducer(torch.zeros(2, 3), torch.ones(3)), r"values must be (2,) or"),
         (lambda: gv.PointProducer(torch.zeros(2, 3), torch.ones(2) / 0), "values must be finite"),
         (

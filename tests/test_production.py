@@ -103,6 +103,25 @@ def test_a_strict_engine_raises_what_failed(how):
         assert picture.stats.converged and picture.alpha.max() > 0.3, "and it goes on"
 
 
+class Reversed(Ball):
+    """Returns (largest, smallest) as the range of nodes at the finest level."""
+
+    def classify(self, nodes):
+        finest = nodes.depth == nodes.layout.depth
+        ends = torch.where(finest[:, None], torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0]))
+        return gv.Regions(kind=super().classify(nodes), ranges={"value": ends[..., None]})
+
+
+@pytest.mark.backend("cpp")
+def test_a_reversed_range_is_named():
+    """The transfer function would show nothing of its nodes."""
+    with gv.Engine(Reversed(), **SIZE) as engine:
+        picture = engine.render(CORNER, GRAY, lod="finest")
+        assert picture.stats.converged and picture.alpha.max() > 0.3
+        reasons = {str(failure).rpartition(": ")[2] for failure in engine.failures}
+        assert reasons == {"the range of channel 'value' is reversed"}
+
+
 @pytest.mark.backend("cpp")
 def test_failures_can_be_forgotten_and_are_then_asked_for_again():
     view, broken = CORNER, Broken("raises")

@@ -441,6 +441,10 @@ def test_graphs_on_cuda_replay_every_model(blobs, model):
             r"origin must broadcast to \(5, 4, 3\)",
         ),
         (
+            lambda: gv.CustomCamera.from_directions(torch.ones(3), torch.ones(0, 4, 3)),
+            r"direction must be \(h, w, 3\) or \(n, h, w, 3\), got \(0, 4, 3\)",
+        ),
+        (
             lambda: gv.CustomCamera.from_directions(torch.ones(3), torch.ones(4, 3)),
             r"direction must be \(h, w, 3\)",
         ),

@@ -96,6 +96,27 @@ def test_values_are_those_of_numpy(named):
     assert single.dtype == torch.float32 and np.abs(single.numpy() - expected).max() < 2e-6
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: sdf.Repeat(
+            sdf.Transform(block(), ((0.5, 0.3, 0), (0, 0.4, 0.2), (0, 0, 0.3))), (2, 2, 0)
+        ),
+        lambda: sdf.Repeat(sdf.Box() & sdf.Plane((1, 1, 1), -0.3), (1, 0, 0)),
+        lambda: sdf.Repeat(sdf.Box() - sdf.Plane((-1, -1, 0), 0.3), (0, 1, 0), (1, 3, 1)),
+    ],
+)
+@pytest.mark.parametrize("by", [0.0, 0.2])
+def test_intervals_of_repeated_shapes_hold_where_cells_change(make, by):
+    """A value that is no distance may be less at the next but one copy, and jumps there."""
+    shape = sdf.Offset(make(), by)
+    center, half = random_boxes(BOXES // 10)
+    low, high = shape.bounds(center, half)
+    value = shape(points_inside(center, half, 27))
+    assert (value >= low[:, None] - 1e-12).all() and (value <= high[:, None] + 1e-12).all()
+    assert ((low > 0) | (high < 0)).double().mean() > 0.15, "and they say something"
+
+
 def test_intervals_hold_in_random_boxes(shape):
     """10^5 boxes: no value at 27 points of each is outside, and no slope is exceeded."""
     center, half = random_boxes(BOXES)
@@ -239,7 +260,16 @@ def test_a_julia_set_takes_any_three_numbers():
         gv.Julia(())
 
 
+def test_a_shape_without_end_is_bounded_by_what_it_is_cut_with():
+    endless = sdf.moved(sdf.Repeat(sdf.Sphere(0.2), (1, 1, 0)), x=0.5)
+    assert endless.box() is None
+    assert (endless & sdf.Box((4, 4, 4))).box().tolist() == [[-2, -2, -2], [2, 2, 2]]
+    with pytest.raises(ValueError, match="must lie within its cell, it has no box"):
+        sdf.Repeat(endless, (1, 1, 1))
+
+
 LONG = sdf.scaled(sdf.Sphere(), 4, 1, 1)  # its value rises by 1/4 per unit of length along x
+CROSSED = sdf.Box((2, 8, 4)) & sdf.Box((8, 2, 4))  # its value is the larger of two distances
 
 
 @pytest.mark.parametrize(
@@ -253,10 +283,17 @@ LONG = sdf.scaled(sdf.Sphere(), 4, 1, 1)  # its value rises by 1/4 per unit of l
         lambda: sdf.Offset(sdf.Revolution(sdf.Extrusion(LONG, 1.0), 1.0), 0.5),
         lambda: sdf.Offset(sdf.Repeat(LONG, (9, 0, 3), (3, 1, 1)), 0.4),
         lambda: sdf.SmoothIntersection(sdf.Offset(LONG, 1.0), sdf.Sphere(7), 0.1),
+        lambda: sdf.Offset(sdf.Extrusion(sdf.Twist(sdf.Torus(), 1.0), 1.0), 0.5),
+        lambda: sdf.Offset(sdf.rotated(CROSSED, (0, 0, 1), 45), 0.8),
+        lambda: sdf.Offset(sdf.Twist(CROSSED, 0.5), 0.8),
+        lambda: sdf.Offset(gv.Mandelbulb(), 0.5),
+        lambda: sdf.Shell(gv.Mandelbox(), 1.0),
     ],
 )
 def test_boxes_hold_what_grows_from_stretched_shapes(make):
-    """Where space is stretched, an offset reaches farther in the world than in the value."""
+    """Where space is stretched, beyond a corner of an intersection, and around a fractal, an offset
+    reaches farther in the world than in the value.
+    """
     shape, points = make(), random_points(100_000, 14.0)
     low, high = shape.box()
     inside = points[shape(points) < 0]

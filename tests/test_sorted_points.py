@@ -88,6 +88,23 @@ def test_a_damaged_folder_is_named(tmp_path, damage):
     assert str(target) in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("column", "kind"),
+    [("code", ["|O", []]), ("code", ["<f8", []]), ("position", ["<f8", [1, 3]]), ("value", None)],
+)
+def test_a_folder_of_other_columns_is_refused(tmp_path, column, kind):
+    """Objects of Python once ended the process."""
+    target = tmp_path / "a.points"
+    gv.sort_points(cloud(2000), folder=target)
+    metadata = json.loads((target / "points.json").read_text())
+    kinds = metadata["points"]["0"]["kinds"]
+    kinds.pop(column)
+    kinds.update({} if kind is None else {column: kind})
+    (target / "points.json").write_text(json.dumps(metadata))
+    with pytest.raises(ValueError, match=f"no sorted points: .*column '{column}'"):
+        gv.PointProducer(target)
+
+
 def test_a_folder_makes_the_picture_of_its_points(tmp_path):
     points = cloud(4000)
     gv.sort_points(points, 64, box=BOX, folder=tmp_path / "a.points")

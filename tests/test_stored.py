@@ -372,6 +372,14 @@ def test_one_thread_reads_a_folder_and_four_a_url(whole, served):
     assert gv.StoredProducer(whole, workers=3).workers == 3
 
 
+def test_another_engine_may_use_it_after_the_first(whole):
+    producer, pictures = gv.StoredProducer(whole), []
+    for _ in range(2):
+        with gv.Engine(producer) as engine:
+            pictures.append(engine.render(VIEW, GRAY).color)
+    assert torch.equal(*pictures)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -57,12 +57,27 @@ def test_gif_and_webp_loop_at_their_speed(tmp_path, suffix, tolerance, fps):
         assert abs(duration - 6000 / fps) <= 5, "rounding to hundredths does not add up"
 
 
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_a_film_that_is_written_again_begins_anew(tmp_path, suffix):
+    Image = pytest.importorskip("PIL.Image")
+    video = gv.Video(tmp_path / f"a{suffix}", WIDTH, HEIGHT, fps=10)
+    for count in (3, 2):
+        with video:
+            for number in range(count):
+                video.add(picture(number))
+        with Image.open(tmp_path / f"a{suffix}") as film:
+            assert film.n_frames == count
+
+
 def test_mp4(tmp_path):
     av = pytest.importorskip("av")
     expected = written(tmp_path / "a.mp4", 12)
     with av.open(str(tmp_path / "a.mp4")) as file:
         decoded = [frame.to_ndarray(format="rgb24").astype(int) for frame in file.decode(video=0)]
         assert file.streams.video[0].average_rate == 12
+        codec = file.streams.video[0].codec_context
+        tags = codec.color_primaries, codec.color_trc, codec.colorspace, codec.color_range
+        assert tags == (1, 13, 6, 1), "players decode what was encoded, whatever its size"
     assert len(decoded) == 6
     for frame, other in zip(decoded, expected, strict=True):
         assert np.abs(frame - other).mean() < 12

@@ -17,6 +17,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -394,13 +395,25 @@ def json_file(kind: str, path: str | Path) -> Any:
         raise ValueError(f"{file}: not a JSON file: {one_line(error)}") from None
 
 
+def real_array(value: Any) -> np.ndarray:
+    """Returns numbers of any shape as an array, which may share their memory; TypeError or
+    ValueError for text, complex numbers, masked ones and anything else.
+    """
+    array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    if array.dtype.kind not in "biuf" or np.ma.is_masked(value):
+        raise TypeError
+    return array
+
+
 def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = None) -> Tensor:
-    """Returns a float64 CPU tensor; ValueError unless finite and of `shape`, if that is given."""
+    """Returns a float64 CPU tensor, which is a copy; ValueError unless finite and of `shape`, if
+    that is given.
+    """
     no_gradient(context, name, value)
     if _is_complex(value):
         raise ValueError(f"{context}: {name} must be real numbers, got {quoted(value)}")
     try:
-        numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu()
+        numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{context}: {name} must be numbers, got {quoted(value)}") from None
     if shape is not None and numbers.shape != shape:

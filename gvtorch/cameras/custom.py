@@ -109,7 +109,7 @@ class CustomCamera(Camera):
             ValueError: A shape is wrong, or (checked on the CPU only) a number is NaN, or a
                 direction 0.
         """
-        if direction.dim() not in (3, 4) or direction.shape[-1] != 3:
+        if direction.dim() not in (3, 4) or direction.shape[-1] != 3 or not direction.numel():
             raise ValueError(
                 "CustomCamera: direction must be (h, w, 3) or (n, h, w, 3), "
                 f"got {describe(direction)}"

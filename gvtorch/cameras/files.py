@@ -46,10 +46,10 @@ _DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FISHEYE = "OPENCV_FISHEYE"
 #: Parameters of COLMAP's models; distorted pinholes are read only if all their coefficients are 0.
 _COLMAP_PARAMETERS = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "SIMPLE_PINHOLE": ("fx", "cx", "cy"),
     "PINHOLE": ("fx", "fy", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "SIMPLE_RADIAL": ("fx", "cx", "cy", "k1"),
+    "RADIAL": ("fx", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     _FISHEYE: ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
@@ -220,36 +220,48 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
         x, y = (int(fields.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
         if not x or not y:
             raise ValueError("does not give the size of the pictures: give width and height")
-        fx = (
-            fields["fl_x"] if "fl_x" in fields else 0.5 * x / math.tan(fields["camera_angle_x"] / 2)
-        )
-        fy = fields.get("fl_y", fx)
-        cx, cy = fields.get("cx", x / 2), fields.get("cy", y / 2)
+        lens = {**fields, "fx": _focal_length(fields, "x", x), "fy": _focal_length(fields, "y", y)}
+        if lens["fx"] is None:
+            raise KeyError("camera_angle_x")
         name = str(fields.get("file_path", f"{number:04d}.png"))
         if name in cameras:
             raise ValueError(f"frame {number}: there is one of {name!r} already")
-        model = fields.get("camera_model", "PINHOLE")
-        cameras[name] = _camera_of_lens(model, view, (fx, fy, cx, cy), fields, (x, y))
+        is_fisheye = fields.get("is_fisheye")  # as instant-ngp says it
+        model = _FISHEYE if is_fisheye else fields.get("camera_model", "PINHOLE")
+        cameras[name] = _camera_of_lens(model, view, lens, (x, y))
     return cameras
 
 
+def _focal_length(fields: Mapping[str, Any], axis: str, size: int) -> Any:
+    """Returns pixels, from the length or the field of view of an axis; None if there is neither."""
+    angle = fields.get(f"camera_angle_{axis}")
+    return fields.get(f"fl_{axis}", angle and 0.5 * size / math.tan(angle / 2))
+
+
 def _camera_of_lens(
-    model: str, view: Tensor, intrinsics: Any, parameters: Mapping[str, Any], size: tuple[int, int]
+    model: str, view: Tensor, lens: Mapping[str, Any], size: tuple[int, int]
 ) -> Camera:
-    """Returns a camera of one of COLMAP's models; `intrinsics` is fx, fy, cx, cy."""
-    fx, fy, cx, cy = intrinsics
+    """Returns a camera of one of COLMAP's models, given its parameters; without fy pixels are
+    square, without cx and cy the axis is in the middle.
+    """
+    _parameters_of(model)
+    fx = lens["fx"]
+    fy = fx if lens.get("fy") is None else lens["fy"]
+    cx, cy = lens.get("cx", size[0] / 2), lens.get("cy", size[1] / 2)
     Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    radial = [float(parameters.get(name) or 0) for name in ("k1", "k2", "k3", "k4")]
-    if model == _FISHEYE:
-        coefficients = radial if any(radial) else None
-        return Camera(view, Ks, *size, model="fisheye", radial_coeffs=coefficients)
-    if model not in _COLMAP_PARAMETERS:
-        raise ValueError(
-            f"camera model {model} is not read; known: {', '.join(_COLMAP_PARAMETERS)}"
-        )
-    if any(parameters.get(name) for name in _DISTORTIONS):
+    distortion = [float(lens.get(name) or 0) for name in _DISTORTIONS]
+    if not any(distortion):
+        return Camera(view, Ks, *size, model="fisheye" if model == _FISHEYE else "pinhole")
+    if model != _FISHEYE:
         raise ValueError(f"a lens of model {model} with distortion is not read: undistort first")
-    return Camera(view, Ks, *size)
+    return Camera(view, Ks, *size, model="fisheye", radial_coeffs=distortion[:4])
+
+
+def _parameters_of(model: str) -> tuple[str, ...]:
+    if model not in _COLMAP_PARAMETERS:
+        known = ", ".join(_COLMAP_PARAMETERS)
+        raise ValueError(f"camera model {model} is not read; known: {known}")
+    return _COLMAP_PARAMETERS[model]
 
 
 def _transforms_content(cameras: Mapping[str, Camera]) -> dict[str, Any]:
@@ -288,26 +300,16 @@ def _read_colmap(path: Path) -> dict[str, Camera]:
     lenses: dict[str, tuple[str, dict[str, float], tuple[int, int]]] = {}
     for line in _read_lines(path / "cameras.txt"):
         number, model, x, y, *values = line.split()
-        if model not in _COLMAP_PARAMETERS:
-            raise ValueError(
-                f"camera model {model} is not read; known: {', '.join(_COLMAP_PARAMETERS)}"
-            )
-        parameters = dict(zip(_COLMAP_PARAMETERS[model], map(float, values), strict=True))
-        lenses[number] = (model, parameters, (int(x), int(y)))
+        lens = dict(zip(_parameters_of(model), map(float, values), strict=True))
+        lenses[number] = (model, lens, (int(x), int(y)))
     cameras = {}
     for line in _read_lines(path / "images.txt", every=2):
-        _, *numbers, lens, name = line.split(maxsplit=9)
+        _, *numbers, number, name = line.split(maxsplit=9)
         pose = check.reals(f"image {name}", "pose", [float(n) for n in numbers], (7,))
         view = torch.eye(4, dtype=torch.float64)
         view[:3, :3], view[:3, 3] = rotation_of(pose[:4].tolist()), pose[4:]
-        model, parameters, size = lenses[lens]
-        fx, fy = (
-            parameters.get("fx", parameters.get("f")),
-            parameters.get("fy", parameters.get("f")),
-        )
-        cameras[name] = _camera_of_lens(
-            model, view, (fx, fy, parameters["cx"], parameters["cy"]), parameters, size
-        )
+        model, lens, size = lenses[number]
+        cameras[name] = _camera_of_lens(model, view, lens, size)
     return cameras
 
 

@@ -1,11 +1,13 @@
 """`CameraPath`: a camera that moves, from key frames.
 
 Positions, targets and fields of view run along Catmull-Rom curves, which pass through every key and
-have no corners. Source: Catmull and Rom, "A class of local interpolating splines", 1974.
+have no corners; fields of view stay between the smallest and the largest of the keys. Source:
+Catmull and Rom, "A class of local interpolating splines", 1974.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -103,8 +105,10 @@ class CameraPath:
         cameras = Camera.orbit(azimuths, elevation, distance, width=1, height=1, up=up).placed(box)
         eye = _eye_positions(cameras)
         center = box.mean(0).expand_as(eye)
-        ups = [upward(context, up).tolist()] * len(eye)
-        return cls(eye.tolist(), center.tolist(), ups, [fov] * len(eye))
+        ups = upward(context, up).expand_as(eye)
+        if abs(math.cos(math.radians(elevation))) < 1e-9:  # at a pole `up` leads nowhere
+            ups = -cameras.viewmats[:, 1, :3]
+        return cls(eye.tolist(), center.tolist(), ups.tolist(), [fov] * len(eye))
 
     @classmethod
     def from_json(
@@ -162,7 +166,8 @@ class CameraPath:
         a, b, c, d = self._keys[index]
         # Cubic through b and c, with the slope at each that of the chord between its neighbours.
         key = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))
-        eye, target, up, fov = key[:3], key[3:6], key[6:9], float(key[9])
+        fov = float(key[9].clamp(*self._keys[:, 9].aminmax()))
+        eye, target, up = key[:3], key[3:6], key[6:9]
         return Camera.look_at(eye, target, up, fov, width, height, model)
 
 

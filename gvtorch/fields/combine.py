@@ -147,11 +147,8 @@ class Blend(Field):
         return self._mix(lambda part: _evaluate(part, points, size))
 
     def _mix(self, evaluate: Callable[[nn.Module], Values]) -> Values:
-        first, second, fraction = (
-            evaluate(self.first),
-            evaluate(self.second),
-            _only_channel(evaluate(self.mask)),
-        )
+        first, second = evaluate(self.first), evaluate(self.second)
+        fraction = _only_channel(evaluate(self.mask))
         if isinstance(first, Mapping) and isinstance(second, Mapping):
             if first.keys() != second.keys():
                 names = f"{', '.join(first)} and {', '.join(second)}"
@@ -166,16 +163,16 @@ class Blend(Field):
 
     def filtered_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Bounds:
         """Returns the hull of both fields' bounds; one field's where the mask is known 0 or 1."""
-        part_bounds = [_bounds_of(part, center, half, size) for part in (self.first, self.second)]
-        if part_bounds[0] is None or part_bounds[1] is None:
+        parts = (self.first, self.second)
+        first, second = (_bounds_of(part, center, half, size) for part in parts)
+        if first is None or second is None:
             return None
         low, high = self._mask_bounds(center, half, size)
-        if isinstance(part_bounds[0], Mapping) and isinstance(part_bounds[1], Mapping):
-            names = {*part_bounds[0]} & {*part_bounds[1]}
-            return {n: between(part_bounds[0][n], part_bounds[1][n], low, high) for n in names}
-        if isinstance(part_bounds[0], Mapping) or isinstance(part_bounds[1], Mapping):
+        if isinstance(first, Mapping) and isinstance(second, Mapping):
+            return {n: between(first[n], second[n], low, high) for n in {*first} & {*second}}
+        if isinstance(first, Mapping) or isinstance(second, Mapping):
             return None
-        return between(part_bounds[0], part_bounds[1], low, high)
+        return between(first, second, low, high)
 
     def _mask_bounds(self, center: Tensor, half: Tensor, size: Tensor | None) -> Interval:
         """Returns the mask's bounds (k,) in boxes; 0 to 1 if they are unknown."""

@@ -125,10 +125,8 @@ class Pair(Distance):
         return self.mix(self.first(points), self.second(points))[0]
 
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        (first, first_color), (second, second_color) = (
-            self.first.surface(points),
-            self.second.surface(points),
-        )
+        first, first_color = self.first.surface(points)
+        second, second_color = self.second.surface(points)
         value, fraction = self.mix(first, second)
         return value, torch.lerp(first_color, second_color, fraction[..., None].to(first_color))
 
@@ -144,11 +142,8 @@ class Pair(Distance):
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:
         """Returns one shape's intervals where only its colour counts, else the hull of both."""
-        first_colors, second_colors = (
-            self.first.colors(center, half),
-            self.second.colors(center, half),
-        )
-        return between(first_colors, second_colors, *self._fraction_bounds(center, half, 0.0))
+        first, second = (part.colors(center, half) for part in (self.first, self.second))
+        return between(first, second, *self._fraction_bounds(center, half, 0.0))
 
     def _fraction_bounds(self, center: Tensor, half: Tensor, rounding: float) -> Interval:
         """Returns intervals (k,) of the second one's share in boxes; values may be off by rounding,

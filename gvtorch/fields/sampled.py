@@ -210,10 +210,8 @@ def _spread(distances: Tensor) -> Tensor:
         count = vectors.shape[axis]
         for step, planes in ((-1, range(1, count)), (1, range(count - 2, -1, -1))):
             for plane in planes:
-                current, neighbour = (
-                    vectors.select(axis, plane),
-                    vectors.select(axis, plane + step).clone(),
-                )
+                current = vectors.select(axis, plane)
+                neighbour = vectors.select(axis, plane + step).clone()
                 neighbour[axis - 1] += step
                 nearer = (neighbour * neighbour).sum(0) < (current * current).sum(0)
                 current.copy_(torch.where(nearer, neighbour, current))

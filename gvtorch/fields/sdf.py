@@ -1,57 +1,29 @@
 """All distance fields under one name: `gv.sdf.Sphere(1) - gv.sdf.Box((1, 1, 1))`."""
 
-from .distance import (
-    Difference,
-    Distance,
-    Intersection,
-    Negative,
-    Pair,
-    SmoothDifference,
-    SmoothIntersection,
-    SmoothUnion,
-    Union,
-)
-from .shapes import Box, Capsule, Gyroid, Menger, Plane, Sphere, Torus
-from .spaces import (
-    Extrusion,
-    Offset,
-    Repeat,
-    Revolution,
-    Shell,
-    Space,
-    Transform,
-    Twist,
-    moved,
-    rotated,
-    scaled,
-)
-
-__all__ = [
-    "Box",
-    "Capsule",
-    "Difference",
-    "Distance",
-    "Extrusion",
-    "Gyroid",
-    "Intersection",
-    "Menger",
-    "Negative",
-    "Offset",
-    "Pair",
-    "Plane",
-    "Repeat",
-    "Revolution",
-    "Shell",
-    "SmoothDifference",
-    "SmoothIntersection",
-    "SmoothUnion",
-    "Space",
-    "Sphere",
-    "Torus",
-    "Transform",
-    "Twist",
-    "Union",
-    "moved",
-    "rotated",
-    "scaled",
-]
+from .distance import Difference as Difference
+from .distance import Distance as Distance
+from .distance import Intersection as Intersection
+from .distance import Negative as Negative
+from .distance import Pair as Pair
+from .distance import SmoothDifference as SmoothDifference
+from .distance import SmoothIntersection as SmoothIntersection
+from .distance import SmoothUnion as SmoothUnion
+from .distance import Union as Union
+from .shapes import Box as Box
+from .shapes import Capsule as Capsule
+from .shapes import Gyroid as Gyroid
+from .shapes import Menger as Menger
+from .shapes import Plane as Plane
+from .shapes import Sphere as Sphere
+from .shapes import Torus as Torus
+from .spaces import Extrusion as Extrusion
+from .spaces import Offset as Offset
+from .spaces import Repeat as Repeat
+from .spaces import Revolution as Revolution
+from .spaces import Shell as Shell
+from .spaces import Space as Space
+from .spaces import Transform as Transform
+from .spaces import Twist as Twist
+from .spaces import moved as moved
+from .spaces import rotated as rotated
+from .spaces import scaled as scaled

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .distance import Changed, Distance, grown
+from .distance import Changed, Distance, Intersection, grown
 from .field import Interval, box_distance, length, tighter, unit_vector
 
 Matrix = Sequence[Sequence[float]]
@@ -65,8 +65,16 @@ class Space(Changed):
         box = self.shape.box()
         return None if box is None else self.around(box)
 
+    @property
+    def _has_far_values(self) -> bool:
+        """Whether the shape's value is at least the distance from its box. Beyond a corner of the
+        box, the larger of two distances is less.
+        """
+        cut = any(type(part) is Intersection for part in self.shape.modules())
+        return self.shape.exact and not cut
+
     def level_box(self, level: Tensor | float) -> Tensor | None:
-        box = None if self.shape.exact else self.shape.level_box(level)
+        box = None if self._has_far_values else self.shape.level_box(level)
         box = None if box is None else self.around(box)
         return super().level_box(level) if box is None else box
 
@@ -113,12 +121,14 @@ class Transform(Space):
 
     def level_box(self, level: Tensor | float) -> Tensor | None:
         """Where the matrix stretches, the value rises by less than 1 per unit of length."""
-        if self.exact:
+        if self.exact and self._has_far_values:
             return grown(self.box(), level)
         box = self.shape.level_box(level / self.scale)
         return None if box is None else self.around(box)
 
-    def around(self, box: Tensor) -> Tensor:
+    def around(self, box: Tensor) -> Tensor | None:
+        if not bool(box.isfinite().all()):  # 0 * infinity is NaN
+            return None
         matrix = torch.linalg.inv(self.inverse)
         middle, half = box.mean(0) @ matrix.mT, (box[1] - box[0]) / 2 @ matrix.abs().mT
         return torch.stack((middle - half, middle + half)) + self.offset
@@ -226,6 +236,23 @@ class Repeat(Space):
             value = torch.minimum(value, other)
         return value, color
 
+    def slope(self, center: Tensor, half: Tensor) -> Tensor:
+        """Returns a huge slope for boxes in which the two nearest cells change: there the value
+        jumps, unless it is a distance, which no other copy can be nearer than.
+        """
+        slope, parts = super().slope(center, half), self.shape.modules()
+        if self.shape.exact and not any(isinstance(part, Intersection) for part in parts):
+            return slope
+        for axis in self._axes:
+            first, last = (
+                (end[:, axis] / self.period[axis])
+                .floor()
+                .clamp(-self._max_cell[axis] - 1, self._max_cell[axis])
+                for end in (center - half, center + half)
+            )
+            slope = torch.where(first < last, 1e30, slope)
+        return slope
+
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
         """Returns boxes (k, 3) that hold the results of `_cells` for all points of boxes."""
         low, high = center - half, center + half
@@ -313,9 +340,13 @@ class Extrusion(Space):
         """Returns the shape's slope, but at least 1, that of the caps."""
         return super().slope(center, half).clamp(min=1)
 
-    def around(self, box: Tensor) -> Tensor:
-        ends = torch.stack((-self.height, self.height)) / 2
-        return torch.cat((box[:, :2], ends[:, None]), 1)
+    def level_box(self, level: Tensor | float) -> Tensor | None:
+        box = self.shape.level_box(level)
+        return None if box is None else self.around(box, level)
+
+    def around(self, box: Tensor, level: Tensor | float = 0.0) -> Tensor:
+        end = self.height / 2 + level
+        return torch.cat((box[:, :2], torch.stack((-end, end))[:, None]), 1)
 
     def _with_caps(self, value: Tensor, plane_distance: Tensor) -> Tensor:
         """Combines a 2D distance (`value`) with the distance from the plane (`plane_distance`)."""

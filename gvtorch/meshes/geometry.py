@@ -7,6 +7,8 @@ Source: Karras, "Maximizing parallelism in the construction of BVHs", HPG 2012 (
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor
 
@@ -37,9 +39,7 @@ class Hierarchy:
             below = padded(levels[-1]).view(-1, ARITY, 6)
             levels.append(torch.cat((below[..., :3].amin(1), below[..., 3:].amax(1)), 1))
         self.box = torch.cat(levels)
-        self.first = [0]
-        for level in levels:
-            self.first.append(self.first[-1] + len(level))
+        self.first = [0, *itertools.accumulate(map(len, levels))]
 
 
 class Geometry:

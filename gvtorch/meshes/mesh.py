@@ -38,8 +38,9 @@ class Material:
 class Mesh:
     """Triangles, with colours and texture coordinates for each of their corners.
 
-    Raises ValueError if a field has the wrong shape, an index is out of range, a position is not
-    finite, or there is no triangle.
+    Arrays of these dtypes are not copied, so they must not be changed afterwards. Raises ValueError
+    if a field has the wrong shape, an index is out of range, a position is not finite, or there is
+    no triangle.
     """
 
     vertices: np.ndarray  # (v, 3) float64, world units, x y z
@@ -65,8 +66,9 @@ class Mesh:
                 continue
             shape = (None if field_name == "vertices" else count, *row_shape)
             expected_shape = ", ".join("n" if n is None else str(n) for n in shape)
+            check.no_gradient(self.name, field_name, value)
             try:
-                array = np.asarray(value)
+                array = check.real_array(value)
                 is_whole = dtype != np.int64 or (array == np.trunc(array)).all()
                 with np.errstate(invalid="ignore"):
                     value = np.ascontiguousarray(array, dtype)
@@ -94,34 +96,31 @@ class Mesh:
             raise ValueError(f"{self.name}: has no triangles")
         if len(self.faces) > MOST_FACES:
             raise ValueError(f"{self.name}: at most {MOST_FACES} triangles, got {len(self.faces)}")
-        low, high = int(self.faces.min()), int(self.faces.max())
-        if low < 0 or high >= len(self.vertices):
-            bad_index = low if low < 0 else high
-            raise ValueError(
-                f"{self.name}: a triangle refers to vertex {bad_index}, "
-                f"there are {len(self.vertices)}"
-            )
-        used = self.vertices[self.faces.ravel()] if len(self.vertices) else self.vertices
+        self._check_indices("vertex", self.faces, len(self.vertices))
+        used = self.corners.reshape(-1, 3)
         bad = int((~np.isfinite(used)).any(1).sum())
         if bad:
             raise ValueError(f"{self.name}: {bad} corners of triangles are NaN or infinite")
         assert self.material is not None
         for entry in check.items(self.name, "materials", self.materials):
             check.instance(self.name, "each of materials", entry, Material)
-        low, high = int(self.material.min()), int(self.material.max())
-        if low < 0 or high >= len(self.materials):
-            bad_index = low if low < 0 else high
-            raise ValueError(
-                f"{self.name}: a triangle refers to material {bad_index}, "
-                f"there are {len(self.materials)}"
-            )
-        if not (self.bounds[1] > self.bounds[0]).any():
+        self._check_indices("material", self.material, len(self.materials))
+        low, high = self.bounds
+        if not (high > low).any():
             raise ValueError(f"{self.name}: all triangles lie in one point")
         with np.errstate(over="ignore"):
-            size = max(float((self.bounds[1] - self.bounds[0]).max()), float(abs(used).max()))
+            size = max(float((high - low).max()), float(abs(used).max()))
         if not _MIN_SIZE <= size <= 1 / _MIN_SIZE:
             limits = f"{_MIN_SIZE:g} to {1 / _MIN_SIZE:g}"
             raise ValueError(f"{self.name}: size must be {limits} world units, got {size:.3g}")
+
+    def _check_indices(self, kind: str, indices: np.ndarray, count: int) -> None:
+        low, high = int(indices.min()), int(indices.max())
+        if low < 0 or high >= count:
+            bad_index = low if low < 0 else high
+            raise ValueError(
+                f"{self.name}: a triangle refers to {kind} {bad_index}, there are {count}"
+            )
 
     @property
     def bounds(self) -> np.ndarray:

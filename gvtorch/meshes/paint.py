@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -40,7 +41,9 @@ class Paint:
         if self._uv is not None and any(texture is not None for texture in textures):
             self._texel, self._texture_layout = _pack_textures(textures, device)
         self._normal = _corner_normals(mesh, geometry)
-        area = geometry.area.to(torch.float32)
+        area = geometry.area
+        unit = 2.0 ** -math.frexp(float(area.max()))[1]  # so that float32 holds them, exactly
+        area = (unit * area).to(torch.float32)
         third = torch.full((len(area), 3), 1 / 3, device=device)
         color = self.color(torch.arange(len(area), device=device), third)
         area_fraction = (area / area.sum().clamp(min=1e-30))[:, None]

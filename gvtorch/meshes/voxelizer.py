@@ -311,10 +311,8 @@ class Voxelizer:
             distance = voxels.distance.clamp(max=self.band)
             channels["distance"] = torch.where(voxels.winding != 0, -distance, distance)[..., None]
         if self.paint is not None:
-            near_surface, face = (
-                voxels.nearest[..., None] >= 0,
-                voxels.nearest.clamp(min=0).view(-1),
-            )
+            near_surface = voxels.nearest[..., None] >= 0
+            face = voxels.nearest.clamp(min=0).view(-1)
             shape, weight = voxels.nearest.shape, voxels.weight.view(-1, 3)
             if "color" in self.channels:
                 color = self.paint.color(face, weight).view(*shape, 4)

@@ -162,12 +162,9 @@ def write_png_rows(
             best_filter = (
                 np.abs(filtered.view(np.int8).astype(np.int16)).sum(2, dtype=np.int64).argmin(0)
             )
-            filtered_lines = np.empty((len(rows), 1 + rows.shape[1]), np.uint8)
-            filtered_lines[:, 0], filtered_lines[:, 1:] = (
-                best_filter,
-                filtered[best_filter, np.arange(len(rows))],
-            )
-            if compressed := compressor.compress(filtered_lines.tobytes()):
+            best_rows = filtered[best_filter, np.arange(len(rows))]
+            lines = np.column_stack((best_filter.astype(np.uint8), best_rows))
+            if compressed := compressor.compress(lines.tobytes()):
                 chunk(b"IDAT", compressed)
         chunk(b"IDAT", compressor.flush())
         chunk(b"IEND", b"")

@@ -223,7 +223,7 @@ class _Pen:
     def color_bar(self, bar: ColorBar, height: int) -> np.ndarray:
         """Returns a colour bar `height` pixels high, numbers to its left and the title above it."""
         ticks = _ticks(bar.low, bar.high)
-        labels = [f"{value:g}" for value in ticks]
+        labels = _labels(ticks)
         size, rim, line = self.size, self._rim, self._line
         left = max(self._text_width(label) for label in labels) + size
         width = max(left + size + 2 * line, self._text_width(bar.title)) + 2 * rim
@@ -262,6 +262,15 @@ def _ticks(low: float, high: float) -> list[float]:
         if last - first < _MAX_TICKS:
             break
     return [n * step for n in range(first, last + 1)]
+
+
+def _labels(ticks: list[float]) -> list[str]:
+    """Returns the ticks as text, with six digits, or as many as tell them apart."""
+    for digits in range(6, 18):
+        labels = [f"{value:.{digits}g}" for value in ticks]
+        if len({*labels}) == len(ticks):
+            break
+    return labels
 
 
 def _power(length: float) -> float:

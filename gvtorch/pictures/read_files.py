@@ -31,6 +31,7 @@ from .tone import from_srgb
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _MAX_HEADER_BYTES = 1 << 20  # bytes
 _LOCK = threading.Lock()
+_MAX_CHANNELS = 6  # numbers a pixel, as `Picture.save` writes to .npy; more are no picture
 _COPIES = 6  # of 8 bytes a number: the pixels read, and the steps to linear light
 
 
@@ -56,7 +57,8 @@ def read_image(path: str | Path) -> Tensor:
         check_regular(path)
         with header_budget(str(path)):
             pixels = _READERS[path.suffix](path)
-    if pixels.ndim != 3 or pixels.shape[-1] < 3 or pixels.dtype.kind not in "uf" or not pixels.size:
+    is_picture = pixels.ndim == 3 and 3 <= pixels.shape[-1] <= _MAX_CHANNELS and pixels.size
+    if not is_picture or pixels.dtype.kind not in "uf":
         raise ValueError(f"{path}: must hold (h, w, 3) numbers, got {pixels.shape} {pixels.dtype}")
     pixels = pixels[..., :4]
     if pixels.dtype.kind == "f":
@@ -188,7 +190,8 @@ def _read_tiff(path: Path) -> np.ndarray:
         max_bytes = MAX_UNPACK_RATIO * path.stat().st_size
         _check_size(path, tuple(series.shape), series.dtype.itemsize, max_bytes)
         check_pictures(series.pages)
-        return series.asarray()
+        pixels = series.asarray()
+        return np.moveaxis(pixels, series.axes.index("S"), -1) if "S" in series.axes else pixels
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {

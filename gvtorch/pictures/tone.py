@@ -15,6 +15,7 @@ from ..base import check
 
 ToneCurve = Literal["none", "reinhard", "aces"]
 CURVES: tuple[ToneCurve, ...] = get_args(ToneCurve)
+_MOST_LIGHT = 1e9  # its square fits into float32
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB with the primaries of Rec. 709
 
 
@@ -25,15 +26,14 @@ def tone_map(
     becomes 0. See `Picture.tone_map`.
     """
     stops = checked_curve("tone_map", curve, exposure)
-    white = check.number("tone_map", "white", white, low=0, open_low=True)
-    color = finite(color) * 2.0**stops
+    white = check.number("tone_map", "white", white, low=1 / _MOST_LIGHT, high=_MOST_LIGHT)
+    color = (finite(color) * 2.0**stops).clamp(max=_MOST_LIGHT)
     if curve == "reinhard":
         weights = torch.stack([torch.full_like(color[..., 0], w) for w in _LUMINANCE], -1)
         light = (color * weights).sum(-1, keepdim=True)
         color = color * ((1 + light / white**2) / (1 + light))
     elif curve == "aces":
-        x = color.clamp(max=1e9)  # so that the squares fit into float32
-        color = x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+        color = color * (2.51 * color + 0.03) / (color * (2.43 * color + 0.59) + 0.14)
     return color.clamp(0, 1)
 
 
@@ -45,7 +45,7 @@ def checked_curve(context: str, curve: str, exposure: float) -> float:
 
 def finite(color: Tensor) -> Tensor:
     """Returns colours without negative numbers, NaN (0 instead) and infinity (1e9 instead)."""
-    return torch.nan_to_num(color, nan=0.0, posinf=1e9, neginf=0.0).clamp(min=0)
+    return torch.nan_to_num(color, nan=0.0, posinf=_MOST_LIGHT, neginf=0.0).clamp(min=0)
 
 
 def to_srgb(color: Tensor) -> Tensor:

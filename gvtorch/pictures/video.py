@@ -16,6 +16,8 @@ from .picture import Picture
 
 #: Endings of films, and the most pixels of a side that their encoders take.
 FILM_SIDES = {".mp4": 16384, ".gif": 65535, ".webp": 16383}
+#: Of sRGB, as PyAV converts it (ITU-T H.273): BT.709 primaries, sRGB curve, BT.601 matrix, limited.
+_H264_COLOR = {"color_primaries": 1, "color_trc": 13, "colorspace": 6, "color_range": 1}
 _MAX_GIF_FPS = 50  # pictures a second; viewers play faster ones slowly
 _PALETTE_FRAMES = 16  # pictures from which the colours of a GIF are taken
 
@@ -102,6 +104,8 @@ class _Mp4:
         self._stream.width, self._stream.height = self._size
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = {"crf": "18"}
+        for name, code in _H264_COLOR.items():  # else players guess by the size of the film
+            setattr(self._stream.codec_context, name, code)
 
     def add(self, pixels: np.ndarray) -> None:
         frame = self._av.VideoFrame.from_ndarray(pixels, format="rgb24")
@@ -124,10 +128,9 @@ class _LoopingFilm:
 
         self._image: Any = Image
         self._suffix, self._fps = suffix, fps
-        self._frames: list[Any] = []
 
     def open(self, part: Path) -> None:
-        self._part = part
+        self._part, self._frames = part, list[Any]()
 
     def add(self, pixels: np.ndarray) -> None:
         self._frames.append(self._image.fromarray(pixels))

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from ..base import check
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points in the world. Tensors and lists become arrays, of float64 unless given as float32.
+    """Points in the world. Tensors and lists become arrays, of float64 unless given as float32;
+    arrays of these dtypes are not copied, so they must not be changed afterwards.
 
     Attributes:
         positions: (n, 3) x, y, z.
@@ -93,11 +93,10 @@ class Points:
 def _checked_array(name: str, value: Any) -> np.ndarray:
     check.no_gradient("Points", name, value)
     try:
-        array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
-        array = np.asarray(array)
+        array = check.real_array(value)
         if array.dtype != np.float32:
             array = array.astype(np.float64, copy=False)
-    except (TypeError, ValueError, RuntimeError):
+    except (TypeError, ValueError):
         raise ValueError(f"Points: {name} must be numbers, got {check.as_text(value)}") from None
     if not bool(np.isfinite(array).all()):
         raise ValueError(f"Points: {name} must be finite, got NaN or infinity")

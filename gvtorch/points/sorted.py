@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -90,22 +90,20 @@ class SortedPoints:
             grid = PointGrid.around(
                 "grid", (), grid_fields["extent"], box, grid_fields["branching"]
             )
+            width = check.integer("a value", "width", meta["width"], low=1)
             tables = {
                 table_kind: {
                     int(level): Table.mapped(
                         folder,
                         f"{table_kind}_{int(level)}",
                         check.integer("rows", "count", table_fields["count"], low=1),
-                        {
-                            name: (str(d), tuple(s))
-                            for name, (d, s) in table_fields["kinds"].items()
-                        },
+                        _checked_kinds(table_kind, table_fields["kinds"], width),
                     )
                     for level, table_fields in meta[table_kind].items()
                 }
                 for table_kind in ("points", "sums")
             }
-            return cls(grid, int(meta["width"]), tables["points"], tables["sums"], folder)
+            return cls(grid, width, tables["points"], tables["sums"], folder)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError(f"{folder}: no sorted points: {error}") from None
 
@@ -200,6 +198,24 @@ def sort_points(
         if draft is not None:
             shutil.rmtree(draft, ignore_errors=True)
         raise
+
+
+def _checked_kinds(
+    table_kind: str, kinds: Any, width: int
+) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Returns dtypes and row shapes of the columns of a folder's table; ValueError unless they are
+    such as `sort_points` writes.
+    """
+    shapes: dict[str, tuple[int, ...]] = {"code": (), "position": (3,), "radius": ()}
+    shapes |= dict.fromkeys(("value", "low", "high"), (width,))
+    needed = {"code", "value"} | ({"position"} if table_kind == "points" else {"low", "high"})
+    if missing := sorted(needed - kinds.keys()):
+        raise ValueError(f"there is no column {missing[0]!r}")
+    for name, (dtype, sizes) in kinds.items():
+        dtypes = (np.int64,) if name == "code" else (np.float32, np.float64)
+        if dtype not in [np.dtype(known).str for known in dtypes] or shapes[name] != tuple(sizes):
+            raise ValueError(f"column {name!r} holds {sizes} {dtype}")
+    return {name: (dtype, tuple(sizes)) for name, (dtype, sizes) in kinds.items()}
 
 
 def _columns(points: Points) -> Rows:
@@ -300,10 +316,8 @@ class _Sorter:
         table = Table(self.folder, name)
         for rows in grouped(counted, {**_SUMS_AND_BOUNDS, "rows": np.add.reduceat}, divide):
             count = rows.pop("rows")
-            rows_below, max_rows = (
-                rows_below + int(count.sum()),
-                max(max_rows, int(count.max(initial=0))),
-            )
+            rows_below += int(count.sum())
+            max_rows = max(max_rows, int(count.max(initial=0)))
             if len(count):
                 table.append(rows)
         return table, 0 < 2 * len(table) <= rows_below or max_rows > _ROWS_WORTH_STORING

@@ -70,10 +70,9 @@ def values(points: SortedPoints, cubes: Cubes, *, narrow: bool = True) -> np.nda
     """Returns (k, z, y, x, c) float64 the mean sum per finest voxel in each voxel; unless `narrow`,
     without points that are narrower than a finest voxel.
     """
-    table = _source_rows(points, cubes.level) if narrow else None
     edge = np.stack(points.grid.edges(cubes.low_k3, cubes.side, cubes.level), 1)
     low = np.ascontiguousarray(cubes.low_k3, np.int64)
-    lists = (*_narrow_lists(points, cubes, table), *_wide_lists(points, cubes))
+    lists = (*_narrow_lists(points, cubes, narrow), *_wide_lists(points, cubes))
     sums = splat(*(torch.from_numpy(array) for array in (edge, low, *lists)))
     scale = points.grid.branching ** (3 * cubes.level)
     return sums.div_(scale).numpy() if scale > 1 else sums.numpy()
@@ -88,11 +87,10 @@ def ranges(
     k = len(cubes.low_k3)
     nonempty, low = np.zeros(k, bool), np.zeros((k, points.width))
     high = np.zeros_like(low)
-    if narrow and (table := _source_rows(points, cubes.level)) is not None:
-        rows, level = table
-        cube_rows = _in_cubes(points, rows["code"], level, cubes)
-        if len(cube_rows[0]):
-            _widen(rows, cube_rows, nonempty, low, high)
+    rows, level = _source_rows(points, cubes.level, narrow)
+    cube_rows = _in_cubes(points, rows["code"], level, cubes)
+    if len(cube_rows[0]):
+        _widen(rows, cube_rows, nonempty, low, high)
     for rows, (row, cube) in _reaching(points, cubes):
         fraction = peak(rows["radius"][row].astype(np.float64), points.grid.spacing_3)
         value = fraction[:, None] * rows["value"][row]
@@ -122,11 +120,16 @@ def _cube_starts(cube: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(cube, prepend=-1))
 
 
-def _source_rows(points: SortedPoints, level: int) -> tuple[Rows, int] | None:
-    """Returns the rows from which a level's sums are computed, and their level, if any."""
-    if stored_levels := [stored for stored in points.sums if stored <= level]:
+def _source_rows(points: SortedPoints, level: int, narrow: bool) -> tuple[Rows, int]:
+    """Returns the rows from which a level's sums are computed, and their level; none if not
+    `narrow`.
+    """
+    stored_levels = [stored for stored in points.sums if stored <= level]
+    if narrow and stored_levels:
         return points.sums[stored_levels[-1]].rows, stored_levels[-1]
-    return (points.points[0].rows, 0) if 0 in points.points else None
+    if narrow and 0 in points.points:
+        return points.points[0].rows, 0
+    return {"code": np.empty(0, np.int64), "value": np.empty((0, points.width))}, 0
 
 
 def _widen(
@@ -233,14 +236,9 @@ def _reaching(points: SortedPoints, cubes: Cubes) -> Iterator[tuple[Rows, _CubeR
             yield rows, (row, cube)
 
 
-def _narrow_lists(
-    points: SortedPoints, cubes: Cubes, table: tuple[Rows, int] | None
-) -> tuple[np.ndarray, ...]:
+def _narrow_lists(points: SortedPoints, cubes: Cubes, narrow: bool) -> tuple[np.ndarray, ...]:
     """Returns the arguments of `ops.splat` for narrow rows: lists of cubes, voxels, values."""
-    if table is None:
-        no_points = (np.empty((0, 3), np.int64), np.empty((0, points.width)))
-        return (*_lists(cubes, np.empty(0, np.int64), np.empty((0, 2), np.int64)), *no_points)
-    rows, level = table
+    rows, level = _source_rows(points, cubes.level, narrow)
     cells = _cells(points, rows["code"], level, cubes)
     distinct, inverse = cells.distinct()
     row, cell = distinct.all_rows()

@@ -124,6 +124,7 @@ def _checked(
         _refuse_late(context, answer, [*fields.values()], layout.device)
         return answer_type(kind=kind, **fields)
     counts = _refuse_bad(answer_type, kind, [*fields.values()], errors)
+    _refuse_reversed(fields.get("ranges", {}), errors)
     missing = sorted(fine_channels - {*fields["constants"]})
     if missing and counts[Region.CONSTANT]:
         raise ValueError(f"{context}: constants must hold channel {missing[0]!r} of CONSTANT items")
@@ -151,6 +152,17 @@ def _refuse_late(
                 raise ValueError(
                     f"{context}: channel {name!r} of a producer that is on_device is not"
                 )
+
+
+def _refuse_reversed(ranges: Mapping[str, Tensor], errors: dict[int, str]) -> None:
+    """Adds an error for each item whose smallest value is above its largest: nothing would be seen
+    of it. Ranges on another device are not read, as the host would wait.
+    """
+    for channel, ends in ranges.items():
+        if ends.device.type == "cpu":
+            smallest, largest = ends.to(torch.float32).unbind(1)
+            for index in (smallest > largest).any(1).nonzero()[:, 0].tolist():
+                errors.setdefault(index, f"the range of channel {channel!r} is reversed")
 
 
 def _by_channel(

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..base import check
 from ..base.rows import distinct_rows
 from ..base.volume import to_numpy
+from ..pool import Channel
 from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
@@ -153,10 +154,7 @@ class FromChildren(OfProducers):
     def _coarse_bricks(self, nodes: Nodes) -> dict[str, Tensor]:
         """Returns the bricks (k, z, y, x, c) of coarse nodes, borders included."""
         layout, loc = nodes.layout, nodes.loc.cpu()
-        shape = (len(loc), *(layout.side,) * 3)
-        arrays = {
-            n: np.empty((*shape, c.width), _numpy_dtype(c.dtype)) for n, c in self.channels.items()
-        }
+        arrays = _zeros(self.channels, len(loc), layout.side)
         for depth, level_rows in by_depth(loc):
             for rows in level_rows.split(_BATCH_BLOCKS):
                 low = loc[rows, :3] * layout.brick_size - layout.border
@@ -206,7 +204,9 @@ class FromChildren(OfProducers):
         raise_first(regions.errors)
         kind = regions.kind.cpu()
         self._refuse_alias(kind)
-        blocks = _uniform(self, regions.constants, len(loc), layout.brick_size)
+        blocks = _zeros(self.channels, len(loc), layout.brick_size)
+        for name, values in regions.constants.items():
+            blocks[name][:] = to_numpy(values.cpu())[:, None, None, None]
         detailed = ((kind != Region.EMPTY) & (kind != Region.CONSTANT)).nonzero()[:, 0]
         if len(detailed):
             is_finest = int(loc[0, 3]) == layout.depth
@@ -215,8 +215,8 @@ class FromChildren(OfProducers):
                 if is_finest
                 else self._means(layout, loc[detailed])
             )
-            for name, values in voxels.items():
-                blocks[name][detailed.numpy()] = values
+            for name, rows in voxels.items():
+                blocks[name][detailed.numpy()] = rows
         return blocks
 
     def _means(self, layout: Layout, loc: Tensor) -> Blocks:
@@ -242,20 +242,9 @@ class FromChildren(OfProducers):
         }
 
 
-def _uniform(
-    producer: Producer, constants: Mapping[str, Tensor], count: int, size: int
-) -> dict[str, np.ndarray]:
-    """Returns (k, z, y, x, c) by channel, filled with its constants (k, c), or 0 without them."""
-    arrays = {}
-    for name, channel in producer.channels.items():
-        arrays[name] = np.zeros(
-            (count, size, size, size, channel.width), _numpy_dtype(channel.dtype)
-        )
-        if name in constants:
-            arrays[name][:] = to_numpy(constants[name].cpu())[:, None, None, None]
-    return arrays
-
-
-def _numpy_dtype(dtype: torch.dtype) -> np.dtype:
-    """Returns the NumPy dtype of arrays that hold a channel."""
-    return to_numpy(torch.zeros(0, dtype=dtype)).dtype
+def _zeros(channels: Mapping[str, Channel], count: int, side: int) -> Blocks:
+    """Returns zeros of all channels."""
+    return {
+        name: to_numpy(torch.zeros((count, *(side,) * 3, channel.width), dtype=channel.dtype))
+        for name, channel in channels.items()
+    }

@@ -213,7 +213,9 @@ class Hypertexture(EvaluationCounter, Producer):
             for rows, reduced in group_alike(self.shape, nodes[level_rows], 0):
                 channels = self._evaluate(nodes[level_rows[rows]], self.level_of(depth), reduced)
                 for name, values in channels.items():
-                    data[name][level_rows[rows]] = values.to(data[name].dtype)
+                    channel = self.channels[name]
+                    stored = values.clamp(*channel.limits).to(channel.dtype)
+                    data[name][level_rows[rows]] = stored
         return data
 
     def _evaluate(self, nodes: Nodes, level: LevelOctaves, shape: nn.Module) -> dict[str, Tensor]:

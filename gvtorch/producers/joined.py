@@ -133,7 +133,9 @@ class JoinedProducer(OfProducers):
         return Bricks(data=data, kind=kind, constants=constants, errors=_errors(bricks))
 
     def _kinds(self, nodes: Nodes, kinds: Sequence[Tensor | None]) -> Tensor:
-        """Returns (k,) regions true for all. An ALIAS raises ValueError; on CUDA it becomes -1."""
+        """Returns (k,) regions true for all; -1, which fails, where any is none. An ALIAS raises
+        ValueError, on CUDA it is -1.
+        """
         device = nodes.loc.device if self.on_device else torch.device("cpu")
         data = torch.full((len(nodes),), int(Region.DATA), device=device)
         stacked = torch.stack(
@@ -146,7 +148,7 @@ class JoinedProducer(OfProducers):
         kind = torch.where(deepest, int(Region.DATA_MAX_DEPTH), int(Region.DATA))
         kind = torch.where(voxels.any(0), kind, int(Region.CONSTANT))
         kind = torch.where((stacked == Region.EMPTY).all(0), int(Region.EMPTY), kind)
-        return torch.where((stacked == Region.ALIAS).any(0), -1, kind)
+        return torch.where((stacked < Region.EMPTY) | (stacked >= Region.ALIAS), -1, kind).amin(0)
 
 
 class StoredChannels(JoinedProducer):

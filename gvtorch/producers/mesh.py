@@ -20,7 +20,7 @@ from .producer import Bricks, Layout, Nodes, Producer, Region, Regions
 
 class MeshProducer(Producer):
     """Makes bricks of a mesh at any level from its triangles. Only what is seen is made, so any
-    resolution is possible. The finest voxels are those that `gv.voxelize` writes.
+    resolution is possible. The finest voxels are, to rounding, those that `gv.voxelize` writes.
 
     In a store, coarse voxels are means of those below; here they are means of 2^3 samples in the
     voxel (materials: one sample). The coverage of solids is the same, to rounding; that of sheets,

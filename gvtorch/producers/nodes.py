@@ -24,6 +24,15 @@ def grid_of(producer: Any) -> dict[str, Any]:
     return {name: getattr(producer, name) for name in names}
 
 
+def _on_device(name: str) -> functools.cached_property[Tensor]:
+    """Returns a property of layouts: three of their numbers as (3,) float64 on their device."""
+
+    def vector(layout: Layout) -> Tensor:
+        return torch.tensor(getattr(layout, name), dtype=torch.float64, device=layout.device)
+
+    return functools.cached_property(vector)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Layout:
     """How an engine divides a producer's world into nodes and bricks."""
@@ -60,20 +69,7 @@ class Layout:
         """s = brick_size + 2 * border, voxels along a side of a brick with its border."""
         return self.brick_size + 2 * self.border
 
-    @functools.cached_property
-    def spacing_3(self) -> Tensor:
-        """(3,) float64 `spacing` on the device."""
-        return torch.tensor(self.spacing, dtype=torch.float64, device=self.device)
-
-    @functools.cached_property
-    def origin_3(self) -> Tensor:
-        """(3,) float64 `origin` on the device."""
-        return torch.tensor(self.origin, dtype=torch.float64, device=self.device)
-
-    @functools.cached_property
-    def extent_3(self) -> Tensor:
-        """(3,) float64 `extent` on the device."""
-        return torch.tensor(self.extent, dtype=torch.float64, device=self.device)
+    spacing_3, origin_3, extent_3 = map(_on_device, ("spacing", "origin", "extent"))
 
     @functools.cached_property
     def reach(self) -> Tensor:

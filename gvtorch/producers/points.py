@@ -122,9 +122,7 @@ class PointProducer(Producer):
     def _warn_overflow(self, sums: Tensor) -> None:
         """Warns once if sums are larger than the channel can hold."""
         (low, high), dtype = self.channels["value"].limits, self.channels["value"].dtype
-        smallest, largest = (
-            (float(extreme) for extreme in torch.aminmax(sums)) if sums.numel() else (0.0, 0.0)
-        )
+        smallest, largest = map(float, sums.aminmax()) if sums.numel() else (0.0, 0.0)
         if not self._warned and (smallest < low or largest > high):
             self._warned = True
             magnitude, dtype_name = max(-smallest, largest), str(dtype).removeprefix("torch.")

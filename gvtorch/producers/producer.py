@@ -59,6 +59,7 @@ def _interpolate(bricks: Tensor, row: Tensor, position: Tensor) -> Tensor:
     """Returns (p, c) float32 values, interpolated trilinearly at `position` (p, 3), in
     voxels, in the bricks with indices `row` (p,) among `bricks` (k, z, y, x, c).
     """
+    position = position.clamp(0, bricks.shape[1] - 1)  # bricks without a border end there
     low = position.floor().clamp(max=bricks.shape[1] - 2)
     fraction, low = (position - low).to(torch.float32), low.to(torch.int64)
     values = bricks.new_zeros((len(row), bricks.shape[-1]), dtype=torch.float32)
@@ -254,10 +255,7 @@ class Producer(torch.nn.Module):
                 raise ValueError(f"{context}: {argument} must be a dict by channel, got a {kind}")
         self.channels = dict(channels) if channels is not None else {"value": Channel()}
         for name, channel in self.channels.items():
-            if not isinstance(channel, Channel):
-                raise ValueError(
-                    f"{context}: channels[{name!r}] must be a Channel, got {channel!r}"
-                )
+            check.instance(context, f"channels[{name!r}]", channel, Channel)
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         for argument, by_channel in (("value_range", self.value_range), ("labels", self.labels)):
             if unknown := sorted(map(str, {*by_channel} - {*self.channels})):
@@ -310,14 +308,17 @@ class Producer(torch.nn.Module):
                 have changed, themselves or anything below them. Left out: everything.
 
         Raises:
-            ValueError: Corners are not finite, or of another shape.
+            ValueError: Corners are not finite, of another shape, or the low one is not below.
         """
         if where is not None and not callable(where):
-            boxes = check.reals(f"{type(self).__name__}.changed", "where", where)
+            context = f"{type(self).__name__}.changed"
+            boxes = check.reals(context, "where", where)
             if boxes.dim() not in (2, 3) or boxes.shape[-2:] != (2, 3):
+                got = check.as_text(boxes)
+                raise ValueError(f"{context}: where must be (2, 3) or (m, 2, 3) corners, got {got}")
+            if not bool((boxes[..., 0, :] <= boxes[..., 1, :]).all()):
                 raise ValueError(
-                    f"{type(self).__name__}.changed: where must be (2, 3) or (m, 2, 3) corners, "
-                    f"got {check.as_text(boxes)}"
+                    f"{context}: where must be low and high corners, got {boxes.tolist()}"
                 )
             where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
         self.version = next(_version_numbers)
@@ -395,7 +396,8 @@ class Producer(torch.nn.Module):
         position = (points.reshape(-1, 3).to(layout.origin_3) - layout.origin_3) / layout.spacing_3
         position = torch.minimum(position.clamp(min=0), layout.extent_3 - 1)  # in voxels
         depth = torch.full_like(position[:, :1], layout.depth)
-        node_loc = torch.cat(((position / layout.brick_size).floor(), depth), 1).to(torch.int64)
+        node = ((position + 0.5) / layout.brick_size).floor()
+        node_loc = torch.cat((node, depth), 1).to(torch.int64)
         loc, row = distinct_rows(node_loc)
         bricks_of = self.bricks_at(loc, layout)
         brick_position = position - node_loc[:, :3] * layout.brick_size + layout.border

@@ -222,7 +222,11 @@ class StoredProducer(Producer):
         self._start_threads()
 
     def prepare(self, layout: Layout) -> None:
-        """Checks that bricks can be cut out of blocks, if there are coarse channels."""
+        """Checks that bricks can be cut out of blocks, if there are coarse channels; starts the
+        threads again if the producer was closed.
+        """
+        if self._closed.is_set():
+            self._start_threads()
         can_cut = _Cubes.of(self.store, layout).are_blocks and layout.depth < self.store.levels
         if len(self.channels) > 1 and not can_cut:
             sizes = [n for n in (8, 16, 32, 64) if self.store.block % n == 0]

@@ -155,14 +155,10 @@ class VolumeProducer(Producer):
     def _node_index(self, nodes: Nodes) -> Tensor:
         """Returns (k,) int64 indices of nodes among those of all levels; outside, the nearest's."""
         loc = nodes.loc.to(self._grids.device)
-        first, size_z, size_y, size_x = self._grids[loc[:, 3]].unbind(1)
-        z, y, x = (
-            coordinate.minimum(n - 1)
-            for coordinate, n in zip(
-                loc[:, :3].flip(1).unbind(1), (size_z, size_y, size_x), strict=True
-            )
-        )
-        return first + (z * size_y + y) * size_x + x
+        first, *sizes = self._grids[loc[:, 3]].unbind(1)
+        nodes_zyx = zip(loc[:, :3].flip(1).unbind(1), sizes, strict=True)
+        z, y, x = (node.minimum(size - 1) for node, size in nodes_zyx)
+        return first + (z * sizes[1] + y) * sizes[2] + x
 
     def _voxel_index(self, nodes: Nodes) -> Tensor:
         """Returns (k, s, s, s) int64 indices of voxels among those of all levels, of the bricks
