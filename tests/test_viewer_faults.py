@@ -24,7 +24,7 @@ from gvtorch.shaders import Labels
 from gvtorch.viewer import view
 from gvtorch.viewer.scene import Scene
 from gvtorch.viewer.server import Server
-from gvtorch.viewer.state import Eye, ViewState
+from gvtorch.viewer.state import Eye, Slices, ViewState
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
@@ -323,3 +323,71 @@ def test_wrong_arguments_of_a_server_are_refused(session, options):
 def test_the_state_of_a_view_is_a_file_or_a_state():
     with pytest.raises(ValueError, match="view: state must be a"):
         new_session(bright_ball(8), GRAY, state=5)
+
+
+def test_a_window_of_slices_may_be_a_list():
+    """It is kept as the tuple that it is a key of; other windows and names are refused."""
+    slices = Slices(window=[20, 100])
+    assert slices == Slices(window=(20.0, 100.0)) and hash(slices.window)
+    for wrong in ({"window": (1, 2, 3)}, {"window": 5}, {"window": (2, 1)}, {"colors": "blue"}):
+        with pytest.raises(ValueError, match=f"Slices: {next(iter(wrong))} must"):
+            Slices(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"shader": 5}, {"options": {}}, {"show": "nodez"}])
+def test_a_state_of_something_else_is_refused(wrong):
+    with pytest.raises(ValueError, match=f"ViewState: {next(iter(wrong))} must be"):
+        ViewState(**{"shader": FUNCTION, **wrong})
+
+
+class Waves(gv.Producer):
+    """A producer with parameters of float64, one of them NaN."""
+
+    def __init__(self) -> None:
+        super().__init__(32)
+        self.height = torch.nn.Parameter(torch.tensor(0.5, dtype=torch.float64))
+        self.phase = torch.nn.Parameter(torch.tensor([float("nan"), 1.0]))
+
+    def fill(self, nodes):
+        return nodes.positions[..., :1].sin().float()
+
+
+def test_parameters_keep_their_dtype_and_pages_read_them_whatever_they_are():
+    """JSON has no NaN: a page that is sent one shows nothing."""
+    producer, texts = Waves(), []
+    session = new_session(producer, GRAY)
+    try:
+        session.join(texts.append)
+        page = Page(session)
+        assert page.camera and not any("NaN" in str(text) for text in texts)
+        assert page.of_type("welcome")[0]["parameters"]["phase"]["value"] == [None, 1.0]
+        page.send("set", name="height", value=0.1)
+        page.next("parameters", 0)
+        assert producer.height.item() == 0.1
+    finally:
+        session.close()
+
+
+@dataclass
+class Size:
+    side: int = 16
+
+
+def cube(size: Size) -> gv.Producer:
+    data = np.zeros((size.side,) * 3, np.uint8)
+    data[: size.side // 2] = 200
+    return gv.VolumeProducer(gv.Volume(data))
+
+
+def test_a_scene_of_another_size_has_its_own_box_and_slices():
+    session = new_session(cube, FUNCTION)
+    try:
+        page = Page(session, 200, 160)
+        page.send("change", state={"slices": {"position": [7, 7, 7]}})
+        page.until(lambda: page.pictures and page.pictures[-1][0]["layout"])
+        page.final()
+        page.send("set", name="side", value=32)
+        assert page.next("parameters", 0)["box"] == [[-0.5] * 3, [31.5] * 3]
+        page.until(lambda: page.pictures[-1][0]["layout"]["x"]["columns"][2] == 31.5)
+    finally:
+        session.close()

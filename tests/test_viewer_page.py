@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -366,4 +368,123 @@ def test_channels_and_labels_have_controls(chromium):
         row.press("Enter")
         tab.until(lambda: viewer.state.shader.ambient == 0.9)
         assert not tab.complaints
+        tab.close()
+
+
+def number_of(tab: Tab, name: str) -> Any:
+    """Returns the field of a number, by its name in the panel."""
+    return tab.page.locator(f"label.gv-row:has(> .gv-name:text-is('{name}')) input").last
+
+
+def test_a_connection_that_was_lost_goes_on_where_it_was(tab, viewer):
+    """The page keeps its camera and open sections, and gets the picture of its camera."""
+    tab.open("Camera")
+    tab.page.mouse.move(*STAGE)
+    tab.page.mouse.wheel(0, -300)
+    tab.page.wait_for_timeout(300)
+    before, eye = tab.final(), tab.app("app.camera.eye")
+    tab.app("app.view.head = null")
+    server = viewer.server
+    for socket in list(server._sockets):
+        asyncio.run_coroutine_threadsafe(socket.close(), server._loop)
+    after = tab.final()
+    assert tab.app("app.camera.eye") == eye and np.array_equal(after, before)
+    assert number_of(tab, "fov").is_visible()
+
+
+def test_keys_pressed_anew_fly_no_faster(tab):
+    """A key that is released and pressed before the next frame starts no second flight."""
+    frames = tab.page.evaluate("""async () => {
+      const stage = document.querySelector(".gv-stage");
+      const { pointer } = document.querySelector(".gv").app;
+      const fly = pointer.fly.bind(pointer);
+      let calls = 0, frames = 0;
+      pointer.fly = (...times) => { calls += 1; return fly(...times); };
+      for (const type of ["keydown", "keyup", "keydown", "keyup", "keydown"]) {
+        stage.dispatchEvent(new KeyboardEvent(type, { key: "w" }));
+      }
+      for (; frames < 6; frames += 1) await new Promise(requestAnimationFrame);
+      stage.dispatchEvent(new KeyboardEvent("keyup", { key: "w" }));
+      return [calls, frames];
+    }""")
+    assert abs(frames[0] - frames[1]) <= 1, frames
+
+
+def test_a_number_that_is_deleted_comes_back(tab, viewer):
+    field = number_of(tab, "exposure")
+    field.fill("2")
+    field.press("Enter")
+    tab.until(lambda: viewer.state.develop.exposure == 2)
+    field.fill("")
+    field.press("Enter")
+    tab.page.wait_for_timeout(200)
+    assert viewer.state.develop.exposure == 2 and field.input_value() == "2"
+
+
+def test_refused_memory_is_shown_as_it_is(tab, viewer, chromium):
+    """What was typed gives way to the memory there is; other pages are told of another one."""
+    tab.open("Memory")
+    pool = number_of(tab, "brick pool")
+    before = pool.input_value()
+    pool.fill("lots")
+    pool.press("Enter")
+    tab.until("app.note.classList.contains('gv-bad')")
+    tab.until(lambda: number_of(tab, "brick pool").input_value() == before)
+    other = Tab(chromium, viewer.url)
+    try:
+        other.until("app?.engine")
+        pool.fill("3 MB")
+        pool.press("Enter")
+        other.until("app.engine.brick_pool === '3 MB'")
+    finally:
+        other.close()
+
+
+def test_only_what_changes_something_is_undone(tab):
+    """Orthographic and back are edits; a click on a point of a function is none."""
+    steps = "app.history.done.length"
+    canvas = tab.page.locator(".gv-tf").bounding_box()
+    x = tab.app("app.panel.editor.x(app.panel.editor.f.opacity[1][0])")
+    y = tab.app("app.panel.editor.y(0.3)")
+    tab.page.mouse.click(canvas["x"] + x, canvas["y"] + y)
+    assert tab.app("app.panel.editor.chosen.index") == 1 and tab.app(steps) == 0
+    tab.page.get_by_label("Orthographic or perspective").click()
+    assert tab.app("app.camera.model") == "ortho" and tab.app(steps) == 1
+    tab.page.get_by_label("Undo").click()
+    assert tab.app("app.camera.model") == "pinhole"
+    tab.final()
+
+
+def test_the_histogram_in_view_is_that_of_the_view(tab):
+    tab.page.get_by_text("in view").click()
+    tab.until("app.panel.editor.histogram.in_view")
+    before = tab.app("app.panel.editor.histogram.counts")
+    tab.page.mouse.move(*STAGE)
+    for _ in range(8):  # inside the ball
+        tab.page.mouse.wheel(0, -300)
+    tab.page.wait_for_timeout(300)
+    tab.final()
+    tab.until(lambda: tab.app("app.panel.editor.histogram.counts") != before)
+
+
+def test_a_scene_without_data_has_the_histogram_of_its_pictures(chromium):
+    ball = gv.FieldProducer(gv.Solid(gv.sdf.Sphere(9)), 32, box=((-10,) * 3, (10,) * 3))
+    with gv.view(ball, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        tab.final()
+        tab.until("app.panel.editor.histogram.in_view")
+        tab.until("app.panel.editor.histogram.counts.some((count) => count > 0)")
+        tab.close()
+
+
+def test_a_handle_moves_the_first_of_several_boxes(chromium):
+    boxes = [((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), ((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))]
+    clip = gv.Clip(boxes=boxes, frame="box")
+    with gv.view(bright_ball(), BANDS, clip=clip, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        tab.app("(app.clip.moveFace(0, 1, -4), app.finishEdit(), null)")
+        tab.until(lambda: viewer.state.options.clip.boxes[0][1][0] < 0.45)
+        assert len(viewer.state.options.clip.boxes) == 2
         tab.close()

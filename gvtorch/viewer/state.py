@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
 from ..pool import N3Tree
 from ..shaders import Shader, TransferFunction
+from ..shaders.channels import window_of
 from ..tracing import Cost, RenderOptions, render
 from .schema import decode, encode
 
@@ -175,11 +176,8 @@ class Slices:
             position = check.triple("Slices", "position", self.position)
             object.__setattr__(self, "position", position)
         if self.window is not None:
-            low, high = (check.number("Slices", "window", value) for value in self.window)
-            if not low < high:
-                raise ValueError(
-                    f"Slices: window must be a low and a high value, got {low}, {high}"
-                )
+            object.__setattr__(self, "window", window_of("Slices", self.window))
+        check.one_of("Slices", "colors", self.colors, ("gray", "shader"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,6 +207,9 @@ class ViewState:
     camera: Eye | None = None
 
     def __post_init__(self) -> None:
+        check.instance("ViewState", "shader", self.shader, Shader)
+        check.instance("ViewState", "options", self.options, RenderOptions)
+        check.one_of("ViewState", "show", self.show, get_args(Show))
         check.integer("ViewState", "component", self.component, low=0)
         check.number("ViewState", "blend", self.blend, low=0, high=1)
         check.number("ViewState", "time", self.time)

@@ -39,6 +39,7 @@ export class App {
     this.root = root;
     this.tool = "orbit";
     this.surfaceLevel = 0;
+    this.open = new Set(["Colours", "Shader", "Picture"]);  // sections of the panel
     this.overlays = { axes: true, scale: true, box: false, nodes: false };
     this.history = new History();
     this.clients = {};
@@ -69,17 +70,19 @@ export class App {
     on("nodes", (message) => this.nodes.receive(message));
     on("note", ({ text }) => this.notify(text));
     on("picked", (message) => this.picked(message));
-    on("parameters", ({ parameters }) => { this.parameters = parameters; this.refresh(); this.askHistogram(this.inView); });
+    on("parameters", ({ parameters, box }) => { Object.assign(this, { parameters, box }); this.refresh(); this.view.drawOverlay(); this.askHistogram(this.inView); });
+    on("engine", ({ engine }) => { this.engine = engine; this.refresh(); });
     on("busy", (busy) => this.busy(busy));
     on("figures", (figures) => this.monitor.receive(figures));
     on("exporting", ({ done, total }) => this.notify(`making the surface … ${Math.round((100 * done) / total)} %`, false, null, true));
-    on("refused", ({ text }) => this.notify(text, true));
+    on("refused", ({ text }) => { this.notify(text, true); this.refresh(); });
     on("error", ({ text }) => this.notify(text, true));
     on("failed", ({ text, count }) => this.notify(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
     on("gone", ({ reason }) => { this.notify(reason || "The view is gone; trying to reach it again …", true); this.root.classList.add("gv-lost"); });
     this.view.element.addEventListener("drawn", ({ detail }) => {
       this.monitor.drawn();
       this.times.drawn(detail);
+      if (detail.final && this.panel?.editor.histogram?.in_view) this.askHistogram(this.inView);
     });
   }
 
@@ -119,7 +122,8 @@ export class App {
     const { camera, ...state } = message.state;
     this.state = state;
     this.unfit = message.unfit;
-    this.camera ??= camera;
+    if (this.camera) this.sendCamera(false);  // a new connection
+    else this.camera = camera;
     this.home = camera;
     this.title.textContent = message.name;
     document.title = this.root.classList.contains("gv-page") ? `${message.name} · gvtorch` : document.title;
@@ -132,7 +136,6 @@ export class App {
     this.refresh();
     this.askHistogram(false);
     if (this.overlays.nodes) this.nodes.show(true);
-    if (this.panel.open.has("Monitor")) this.setMonitor(true);
   }
 
   refresh() {
@@ -168,8 +171,9 @@ export class App {
     this.view.drawOverlay();
   }
 
-  /** Adds an edit of the state to the history. */
+  /** Adds an edit of the state to the history, unless it changed nothing. */
   remember(before, after) {
+    if (JSON.stringify(before) === JSON.stringify(after)) return;
     this.history.push(() => this.replaceState(before), () => this.replaceState(after));
   }
 
@@ -189,24 +193,18 @@ export class App {
     if (!this.history.redo()) this.notify("there is nothing to do again");
   }
 
-  /** Sets a parameter of the scene, or the engine's memory. */
-  setValue(type, values, name, value, message) {
-    const before = type === "set" ? values[name].value : values[name];
-    const apply = (newValue) => {
-      if (type === "resize") values[name] = newValue;
-      this.link.send(type, message(newValue));
-      this.refresh();
-    };
+  /** Sets a parameter of the scene, or the engine's memory; the answer shows it. */
+  setValue(type, before, value, message) {
+    const apply = (newValue) => this.link.send(type, message(newValue));
     this.history.push(() => apply(before), () => apply(value));
     apply(value);
   }
 
+  /** Loads a saved state; the answer shows it, and sets the camera. */
   load(state) {
-    const { camera: _, ...rest } = state, before = this.state;
-    this.link.send("change", { state, rest: true });  // the answer sets the camera
-    this.state = merged(this.state, rest);
-    this.remember(before, this.state);
-    this.refresh();
+    const before = this.state, send = (content) => this.link.send("change", { state: content, rest: true });
+    this.history.push(() => this.replaceState(before), () => send({ ...state, camera: undefined }));
+    send(state);
   }
 
   // Colours.
@@ -275,7 +273,7 @@ export class App {
 
   finishMove() {
     this.sendCamera(false);
-    if (this.panel?.open.has("Camera")) this.refresh();
+    if (this.open.has("Camera")) this.refresh();
   }
 
   finishMoveSoon() {
@@ -309,7 +307,7 @@ export class App {
   }
 
   switchOrtho() {
-    this.moveCamera({ ...this.camera, model: this.camera.model === "ortho" ? "pinhole" : "ortho" }, false);
+    this.changeCamera({ ...this.camera, model: this.camera.model === "ortho" ? "pinhole" : "ortho" }, true);
     this.refresh();
   }
 

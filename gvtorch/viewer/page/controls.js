@@ -72,12 +72,13 @@ export class Controls {
 
   number(field, value, set) {
     const isInteger = field.type === "whole";
-    const parse = (text) => (text === "" && field.optional ? null : isInteger ? Math.round(Number(text)) : Number(text));
-    const input = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: field.optional ? "auto" : "" });
+    const parse = (text) => (text === "" ? (field.optional ? null : NaN) : isInteger ? Math.round(Number(text)) : Number(text));
+    const shown = typeof value === "number" ? Number(value.toPrecision(6)) : "";
+    const input = el("input.gv-number", { type: "number", step: "any", value: shown, placeholder: field.optional ? "auto" : "" });
     let slider = null;
     input.onchange = () => {
       const number = parse(input.value);
-      if (number !== null && !Number.isFinite(number)) return;
+      if (number !== null && !Number.isFinite(number)) { input.value = shown; return; }
       if (slider && number !== null) slider.value = number;
       set(number, true);
     };

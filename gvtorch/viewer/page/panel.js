@@ -8,7 +8,6 @@ import { TransferEditor, domain } from "./transfer.js";
 export class Panel {
   constructor(app) {
     this.app = app;
-    this.open = new Set(["Colours", "Shader", "Picture"]);
     this.controls = new Controls(app.schema, (kind, name) => this.newObject(kind, name), () => ({ ...app.unfit, ...this.unfit }));
     this.unfit = unfitColours(app.widths);
     this.editor = new TransferEditor((f, rest) => app.changeTransfer(f, rest));
@@ -57,8 +56,8 @@ export class Panel {
   section(name, ...rows) {
     const shown = rows.flat().filter(Boolean);
     if (!shown.length) return null;
-    const element = el("details.gv-section", { open: this.open.has(name) }, el("summary", {}, name), ...shown);
-    element.addEventListener("toggle", () => (element.open ? this.open.add(name) : this.open.delete(name)));
+    const element = el("details.gv-section", { open: this.app.open.has(name) }, el("summary", {}, name), ...shown);
+    element.addEventListener("toggle", () => (element.open ? this.app.open.add(name) : this.app.open.delete(name)));
     return element;
   }
 
@@ -179,7 +178,7 @@ export class Panel {
     const { app } = this;
     return Object.entries(app.parameters ?? {}).map(([name, parameter]) =>
       this.controls.row(name, parameter, parameter.value, (value, rest) => {
-        if (rest) app.setValue("set", app.parameters, name, value, (newValue) => ({ name, value: newValue }));
+        if (rest) app.setValue("set", parameter.value, value, (newValue) => ({ name, value: newValue }));
       }));
   }
 
@@ -202,7 +201,7 @@ export class Panel {
     return Object.entries(app.engine).map(([name, value]) => {
       const field = name.endsWith("pool") ? { type: "text", text: fields[name].text } : fields[name];
       return this.controls.row(name, field, value, (newValue, rest) => {
-        if (rest) app.setValue("resize", app.engine, name, newValue, (sentValue) => ({ engine: { [name]: sentValue } }));
+        if (rest) app.setValue("resize", value, newValue, (sentValue) => ({ engine: { [name]: sentValue } }));
       });
     });
   }

@@ -139,8 +139,8 @@ export class Pointer {
     if (event.altKey || !app.camera) return;
     if (key in KEYS) {
       event.preventDefault();
-      if (!this.keys.size) requestAnimationFrame((now) => this.fly(now, now));
       this.keys.add(key);
+      this.flight ||= requestAnimationFrame((now) => this.fly(now, now));
     } else if ("123456".includes(key)) app.faceAxis(Math.floor((key - 1) / 2), key % 2 ? 1 : -1);
     else if (key === "f" || key === "home") app.link.send("do", { what: "fit" });
     else if (key === "o") app.switchOrtho();
@@ -155,6 +155,7 @@ export class Pointer {
   /** Flies while keys are held. */
   fly(now, lastTime) {
     const { app } = this;
+    this.flight = 0;
     if (!this.keys.size) return app.finishMove();
     const { right, up, forward } = axes(app.camera);
     let direction = [0, 0, 0];
@@ -165,6 +166,6 @@ export class Pointer {
     const seconds = Math.min(0.1, (now - lastTime) / 1000);
     const pace = Math.max(halfHeight(app.camera), 0.02 * distance(app.camera));
     app.moveCamera(shifted(app.camera, times(direction, seconds * pace * 1.2 * this.speed)), true);
-    requestAnimationFrame((next) => this.fly(next, now));
+    this.flight = requestAnimationFrame((next) => this.fly(next, now));
   }
 }
