@@ -44,6 +44,25 @@ def test_a_state_with_more_items_than_json_may_hold_comes_back(shader):
     assert changed.shader.visible == shader.visible and changed.shader.colors == shader.colors
 
 
+def test_labels_and_channels_are_saved_with_the_colours_that_they_show():
+    """Names, sRGB arrays and defaults become linear numbers, and sets of labels lists."""
+    for shader in (
+        Labels(np.array([[0, 0, 0], [255, 0, 0]], np.uint8), visible={2, 1}),
+        Labels({1: "#ff0000"}, visible=frozenset((1, 2))),
+    ):
+        content = ViewState(shader=shader).to_json()["shader"]
+        loaded = ViewState(shader=GRAY).changed({"shader": content}).shader
+        assert np.array_equal(loaded(np.arange(4)), shader(np.arange(4)))
+        assert loaded.visible == [1, 2] and loaded(np.array([1]))[0, :3].tolist() == [1, 0, 0]
+    shader = gv.Channels([gv.ChannelLook(window=(0, 1), color="green"),
+                          gv.ChannelLook(window=(0, 1)), GRAY])  # fmt: skip
+    content = ViewState(shader=shader).to_json()["shader"]
+    assert [look["color"] for look in content["looks"]] == [[0, 1, 0], [0, 1, 0], None]
+    loaded = ViewState(shader=GRAY).changed({"shader": content}).shader
+    for n, (look, other) in enumerate(zip(loaded.looks, shader.looks, strict=True)):
+        assert np.array_equal(look.function(n, 3).color, other.function(n, 3).color)
+
+
 def test_a_message_names_the_wrong_label_once():
     state = ViewState(shader=Labels())
     content = {"kind": "Labels", "colors": {"5": [1, 2, 3, 4, 5]}}

@@ -348,6 +348,8 @@ def test_channels_and_labels_have_controls(chromium):
         tab.until("app?.state")
         before = tab.final()
         assert before[..., 0].max() > 150 and before[..., 1].max() > 150
+        swatches = tab.page.locator("input.gv-color").evaluate_all("(all) => all.map((c) => c.value)")
+        assert "#ff0000" in swatches and "#00ff00" in swatches
         first = tab.page.locator("div.gv-group:has(> .gv-strong:text-is('tubulin'))")
         first.locator("label.gv-row:has-text('visible') input").uncheck()
         tab.until(lambda: tab.final()[..., 0].max() < 60)
@@ -487,4 +489,19 @@ def test_a_handle_moves_the_first_of_several_boxes(chromium):
         tab.app("(app.clip.moveFace(0, 1, -4), app.finishEdit(), null)")
         tab.until(lambda: viewer.state.options.clip.boxes[0][1][0] < 0.45)
         assert len(viewer.state.options.clip.boxes) == 2
+        tab.close()
+
+
+def test_of_more_labels_than_have_a_row_none_is_hidden_by_another(chromium):
+    """A list of those that are shown could name only those with a row."""
+    names = np.arange(17**3, dtype=np.uint16).reshape(17, 17, 17)
+    with gv.view(gv.Volume(names, labels=True), browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        assert tab.page.get_by_text("817 labels above 4095 have no row").is_visible()
+        row = tab.page.locator(".gv-label:has-text('17')").first
+        assert row.locator("input[type=checkbox]").is_disabled()
+        row.get_by_text("only").click()
+        tab.until(lambda: viewer.state.shader.visible == [17])
+        assert row.locator("input[type=checkbox]").is_enabled() and not tab.complaints
         tab.close()

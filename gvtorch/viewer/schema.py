@@ -14,8 +14,8 @@ import inspect
 import itertools
 import math
 import types
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import Enum
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -56,6 +56,13 @@ _ARGUMENT_READERS: dict[tuple[str, str], Any] = {
     ("Features", "channel"): lambda shader: shader.other,
     ("Gradient", "top"): lambda gradient: gradient.ends[0],
     ("Gradient", "bottom"): lambda gradient: gradient.ends[1],
+    ("Labels", "colors"): lambda labels: labels.linear_colors(),
+    ("Channels", "looks"): lambda channels: [
+        replace(look, color=look.function(n, len(channels.looks)).color[-1, 1:])
+        if look.transfer is None
+        else look
+        for n, look in enumerate(channels.looks)
+    ],
 }
 #: Arguments that no control changes: they belong to the scene, not to its look.
 _SCENE_ARGUMENTS = {
@@ -125,6 +132,8 @@ def encode(value: Any) -> Any:
             max(value.shape, default=0) <= MAX_ITEMS and math.prod(value.shape) <= _MAX_NUMBERS
         )
         value = value.tolist() if is_small else _kept_marker(value)
+    elif isinstance(value, Set):
+        value = sorted(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
     elif isinstance(value, (Mapping, list, tuple, range)) and len(value) > MAX_ITEMS:
