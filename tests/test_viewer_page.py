@@ -348,8 +348,9 @@ def test_channels_and_labels_have_controls(chromium):
         tab.until("app?.state")
         before = tab.final()
         assert before[..., 0].max() > 150 and before[..., 1].max() > 150
-        swatches = tab.page.locator("input.gv-color").evaluate_all("(all) => all.map((c) => c.value)")
-        assert "#ff0000" in swatches and "#00ff00" in swatches
+        swatches = tab.page.locator("input.gv-color")
+        values = swatches.evaluate_all("(inputs) => inputs.map((input) => input.value)")
+        assert "#ff0000" in values and "#00ff00" in values
         first = tab.page.locator("div.gv-group:has(> .gv-strong:text-is('tubulin'))")
         first.locator("label.gv-row:has-text('visible') input").uncheck()
         tab.until(lambda: tab.final()[..., 0].max() < 60)
