@@ -202,7 +202,7 @@ class Look:
         """Returns the shader of a mesh's stored colours, and of its normals if `names` has them."""
         from ..shaders import StoredColor
 
-        self._refuse_flags("colours are stored", "component")
+        self._refuse_flags("colours are stored", "component", "channel")
         # An opaque voxel must be opaque within its own width: light enters no farther.
         options: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
         if len(names) == 1:
@@ -265,11 +265,12 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
     """Returns azimuth, elevation and distance of AZ,EL, AZ,EL,fit or AZ,EL,DIST; the distance is
     None if the whole box is to be in the picture. Raises ValueError for any other text.
     """
-    if text.count(",") == 1 or text.endswith(",fit"):
-        azimuth, elevation = parse_numbers(flag, text.removesuffix(",fit"), 2, float)
-        return azimuth, elevation, None
-    azimuth, elevation, distance = parse_numbers(flag, text, 3, float)
-    return azimuth, elevation, distance
+    numbers = text.removesuffix(",fit")
+    count = numbers.count(",") + 1
+    if count not in (2, 3) or (count == 3 and numbers != text):
+        raise ValueError(f"{flag} must be AZ,EL or AZ,EL,DIST, got {text!r}")
+    azimuth, elevation, *distance = parse_numbers(flag, numbers, count, float)
+    return azimuth, elevation, distance[0] if distance else None
 
 
 def up_and_front(space: str | None) -> tuple[Up, float]:

@@ -183,7 +183,7 @@ def parse_background(text: str) -> Any:
 
     if text == "transparent":
         return None
-    if Path(text).suffix in (".png", ".exr", ".npy", ".tif"):
+    if Path(text).suffix[1:].isalpha():
         return Environment.read(text)
     top, slash, bottom = text.partition("/")
     if slash:

@@ -74,29 +74,37 @@ class Streaming:
         has_normals = self.image is None and "normal" in channel_names(folder)
         return ("color", "normal") if has_normals else ("color",)
 
-    def producer_and_shader(self, store: Store, look: Look) -> tuple[Producer, Shader]:
-        """Returns the producer that streams a store, and the shader."""
-        from ..producers import StoredChannels, StoredProducer
+    def shader(self, store: Store, look: Look) -> Shader:
+        """Returns the shader that shows a store."""
         from ..shaders import Filtered, Lit
 
         names = self._mesh_channels(store, look)
         shader = look.stored_color_shader(store, names) if names else look.make_shader(store)
-        filtered = shader if isinstance(shader, Filtered) else None
-        if filtered is not None and look.tf is None:
+        if not isinstance(shader, Filtered):
+            return shader
+        if look.tf is None and look.window is None:
             stored = Filtered.stored(store)
-            if stored.numbers != filtered.numbers:
+            if stored.numbers != shader.numbers:
                 shader_flags = "--shader filtered" + "-lit" * isinstance(stored.transfer, Lit)
                 raise ValueError(
                     f"{store.location}: its filtered colours are for {shader_flags}; "
                     "gvtorch filter, with --lit or without, makes others"
                 )
-            shader = filtered = stored
-        if filtered is not None and filtered.component != look.component:
-            raise ValueError(f"--component must be that of the colours, {filtered.component}")
-        if len(names) > 1:
+            shader = stored
+        if shader.component != look.component:
+            raise ValueError(f"--component must be that of the colours, {shader.component}")
+        return shader
+
+    def producer(self, store: Store, shader: Shader) -> Producer:
+        """Returns the producer that streams a store for its shader."""
+        from ..producers import StoredChannels, StoredProducer
+        from ..shaders import Filtered, StoredColor
+
+        if isinstance(shader, StoredColor) and shader.normals is not None:
             folder = store.location.rpartition("/")[0]
-            return StoredChannels(folder, names, host_cache=self.host_cache), shader
-        return StoredProducer(store, host_cache=self.host_cache, filtered=filtered), shader
+            return StoredChannels(folder, shader.channels, host_cache=self.host_cache)
+        filtered = shader if isinstance(shader, Filtered) else None
+        return StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
 
     def engine_options(self, look: Look, data: Volume | Store) -> dict[str, Any]:
         """Returns fields of `EngineOptions`."""

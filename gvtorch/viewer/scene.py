@@ -312,10 +312,19 @@ def open_scene(what: Any, **options: Any) -> Scene:
         return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
-    data, series = _open_data(what), series_of(what)
+    data = _open_data(what)
     options.setdefault("border", data.info.default_border)
-    engine = Engine(_producer_of(data), **options)
-    return Scene(data.name, engine, data=data, remake=_producer_of, **series)
+    return streamed_scene(data, _producer_of, series_of(what), **options)
+
+
+def streamed_scene(
+    data: Volume | Store, remake: Remake, series: dict[str, Any], **options: Any
+) -> Scene:
+    """Returns the scene of a volume or a store, which is one of a series (see `series_of`);
+    `options` are fields of `EngineOptions`.
+    """
+    engine = Engine(remake(data), **{"time_budget": _BUDGET_MS, **options})
+    return Scene(data.name, engine, data=data, remake=remake, **series)
 
 
 def _producer_of(data: Volume | Store | None) -> Producer:
