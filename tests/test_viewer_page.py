@@ -404,10 +404,10 @@ def test_keys_pressed_anew_fly_no_faster(tab):
       let calls = 0, frames = 0;
       pointer.fly = (...times) => { calls += 1; return fly(...times); };
       for (const type of ["keydown", "keyup", "keydown", "keyup", "keydown"]) {
-        stage.dispatchEvent(new KeyboardEvent(type, { key: "w" }));
+        stage.dispatchEvent(new KeyboardEvent(type, { key: "w", bubbles: true }));
       }
       for (; frames < 6; frames += 1) await new Promise(requestAnimationFrame);
-      stage.dispatchEvent(new KeyboardEvent("keyup", { key: "w" }));
+      stage.dispatchEvent(new KeyboardEvent("keyup", { key: "w", bubbles: true }));
       return [calls, frames];
     }""")
     assert abs(frames[0] - frames[1]) <= 1, frames
@@ -506,3 +506,49 @@ def test_of_more_labels_than_have_a_row_none_is_hidden_by_another(chromium):
         tab.until(lambda: viewer.state.shader.visible == [17])
         assert row.locator("input[type=checkbox]").is_enabled() and not tab.complaints
         tab.close()
+
+
+def test_keys_work_wherever_the_focus_is(tab, viewer):
+    """On a fresh page, and beside a slider; in a field, keys are text."""
+    tab.page.keyboard.press("o")
+    tab.until("app.camera.model === 'ortho'")
+    slider = tab.page.locator("label.gv-row:has(> .gv-name:text-is('exposure')) input[type=range]")
+    slider.focus()
+    tab.page.keyboard.press("ArrowRight")
+    tab.until(lambda: viewer.state.develop.exposure > 0)
+    tab.page.keyboard.press("f")
+    tab.page.keyboard.press("Control+z")
+    tab.until(lambda: viewer.state.develop.exposure == 0)
+    number_of(tab, "exposure").focus()
+    tab.page.keyboard.press("Control+z")
+    tab.page.wait_for_timeout(100)
+    assert tab.app("app.camera.model") == "ortho"
+    tab.final()
+
+
+def test_a_picture_that_can_not_be_shown_is_followed_by_others(tab, viewer):
+    head = "{ number: 0, camera: app.camera }"
+    tab.app(f"app.link.emit('picture', {{ head: {head}, bytes: new Uint8Array(9) }})")
+    tab.until("app.note.classList.contains('gv-bad')")
+    number = tab.app("app.view.head.number")
+    tab.page.mouse.move(*STAGE)
+    tab.page.mouse.wheel(0, -200)
+    tab.until(f"app.view.head.number > {number}")
+    tab.final()
+
+
+def test_letters_that_are_not_drawn_are_not_hit(tab):
+    """The letters of the axes, where the camera is no plane."""
+    x, y = tab.app("app.view.axisLetters[0].at.map((number) => number / app.view.ratio)")
+    assert tab.app(f"app.view.axisAt({x}, {y})")
+    tab.app("(app.changeCamera({ ...app.camera, model: 'fisheye' }, true), null)")
+    assert not tab.app(f"app.view.axisAt({x}, {y})")
+    tab.final()
+
+
+def test_what_is_too_long_for_a_message_keeps_the_connection(tab):
+    number = tab.app("app.number")
+    tab.app("app.presets.read('a.json', '\"'.repeat(700000), null)")  # twice as long in JSON
+    tab.until("app.note.textContent.includes('read: 1400')")
+    tab.page.wait_for_timeout(700)
+    assert tab.app("app.number") == number

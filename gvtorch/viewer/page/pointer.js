@@ -20,9 +20,11 @@ export class Pointer {
     on("wheel", (event) => this.wheel(event));
     on("dblclick", (event) => this.focus(event));
     on("contextmenu", (event) => event.preventDefault());
-    on("keydown", (event) => this.key(event));
-    on("keyup", (event) => this.keys.delete(event.key.toLowerCase()));
     on("blur", () => this.keys.clear());
+    window.addEventListener("blur", () => this.keys.clear());
+    const keyboard = app.root.classList.contains("gv-page") ? document : app.root;
+    keyboard.addEventListener("keydown", (event) => this.key(event));
+    keyboard.addEventListener("keyup", (event) => this.keys.delete(event.key.toLowerCase()));
   }
 
   /** CSS pixels from the stage's corner. */
@@ -129,14 +131,16 @@ export class Pointer {
     this.app.link.send("pick", { x: clamp((x - left) / width, 0, 1), y: clamp((y - top) / height, 0, 1), purpose: "focus" });
   }
 
+  /** Handles a key, unless a control has a use for it. */
   key(event) {
-    const key = event.key.toLowerCase(), { app } = this;
+    const key = event.key.toLowerCase(), { app } = this, { target } = event;
+    if (["number", "text"].includes(target.type)) return;
     if (event.ctrlKey || event.metaKey) {
       if (key === "z" && event.shiftKey) app.redo();
       else if (key === "z") app.undo();
       return;
     }
-    if (event.altKey || !app.camera) return;
+    if (event.altKey || !app.camera || app.panel.element.contains(target)) return;
     if (key in KEYS) {
       event.preventDefault();
       this.keys.add(key);

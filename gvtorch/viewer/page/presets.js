@@ -4,7 +4,6 @@ import { el, iconButton, saveFile, openText } from "./dom.js";
 import { domain } from "./transfer.js";
 
 const STORAGE_KEY = "gvtorch transfer functions";
-const MAX_CHARACTERS = 900000;  // characters of a file that may be sent
 const SUFFIXES = ".json,.vp,.xml";
 
 /** The user's own functions by name; none if the browser stores nothing. */
@@ -77,7 +76,6 @@ export class Presets {
   }
 
   read(file, text, name) {
-    if (text.length > MAX_CHARACTERS) return this.app.notify(`${file}: ${text.length} letters, more than ${MAX_CHARACTERS}`, true);
     this.app.link.send("read", { file, text, name, ...this.span() });
   }
 
