@@ -280,14 +280,18 @@ class ViewState:
         """Returns the state as plain values, ready for JSON."""
         return encode(self)
 
-    def changed(self, content: Any) -> ViewState:
+    def changed(self, content: Any, source: str | Path = "") -> ViewState:
         """Returns the state with the fields of plain JSON in place of its own; fields that it
         leaves out, or marks as kept, stay.
 
         Raises:
-            ValueError: A field is unknown, or a value out of its range.
+            ValueError: A field is unknown, or a value out of its range; the message begins with
+                `source`, where the JSON comes from.
         """
-        return decode("state", ViewState, content, self)
+        try:
+            return decode("state", ViewState, content, self)
+        except ValueError as error:
+            raise ValueError(f"{source}: {one_line(error)}" if source else str(error)) from None
 
     def save(self, path: str | Path) -> None:
         """Writes a .json file."""
@@ -303,11 +307,7 @@ class ViewState:
             FileNotFoundError: There is no such file.
             ValueError: It holds something else; the message names it.
         """
-        content = saved_state(path)
-        try:
-            return self.changed(content)
-        except ValueError as error:
-            raise ValueError(f"{path}: {one_line(error)}") from None
+        return self.changed(saved_state(path), path)
 
 
 def transfer_of(shader: Shader) -> TransferFunction | None:
