@@ -149,6 +149,29 @@ def growing(settings: Speed) -> gv.Producer:
     return gv.FieldProducer(Grown(), settings.size, box=CLOCK_BOX)
 
 
+def test_a_time_point_chosen_while_another_fails_is_shown():
+    session, chosen = new_session(bright_ball(), FUNCTION), threading.Event()
+
+    def reopen(time: int) -> gv.Volume:
+        if time == 1:
+            chosen.wait(TIMEOUT)
+            raise OSError("the disk is gone")
+        return bright_ball()
+
+    try:
+        page = Page(session)
+        page.final()
+        session.ask(lambda: vars(session.scene).update(times=3, reopen=reopen))
+        for time_point in (1, 2):
+            page.send("change", state={"time": time_point})
+        page.next("state", 1)
+        chosen.set()
+        assert "time 1: the disk is gone" in page.next("error", 0)["text"]
+        page.until(lambda: page.pictures[-1][0]["time"] == 2)
+    finally:
+        session.close()
+
+
 def test_a_scene_that_is_made_again_keeps_the_time_of_its_clocks():
     session = new_session(growing, gv.TransferFunction([(0.4, 0), (0.6, 1)]))
     try:

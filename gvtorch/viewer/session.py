@@ -449,11 +449,13 @@ class Session:
             self._open_planes(self.state)
 
     def _time_failed(self, time_point: float, error: Exception) -> None:
-        """Sets the state back to the time that is shown."""
+        """Sets the state back to the time that is shown, unless it wants another one meanwhile."""
         self._pending_time = None
-        self.state = replace(self.state, time=self.scene.time)
         self._broadcast("error", text=f"time {time_point:g}: {one_line(error)}")
-        self._broadcast_state(None)
+        if self.state.time == time_point:
+            self.state = replace(self.state, time=self.scene.time)
+            self._broadcast_state(None)
+        self._update_time()
 
     def _take_pick(self, client: Client, message: protocol.Pick) -> None:
         position = client.position_at(message.x, message.y)

@@ -75,8 +75,7 @@ export class App {
     on("busy", (busy) => this.busy(busy));
     on("figures", (figures) => this.monitor.receive(figures));
     on("exporting", ({ done, total }) => this.notify(`making the surface … ${Math.round((100 * done) / total)} %`, false, null, true));
-    on("refused", ({ text }) => { this.notify(text, true); this.refresh(); });
-    on("error", ({ text }) => this.notify(text, true));
+    for (const type of ["refused", "error"]) on(type, ({ text }) => { this.notify(text, true); this.refresh(); });
     on("failed", ({ text, count }) => this.notify(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
     on("gone", ({ reason }) => { this.notify(reason || "The view is gone; trying to reach it again …", true); this.root.classList.add("gv-lost"); });
     this.view.element.addEventListener("drawn", ({ detail }) => {
