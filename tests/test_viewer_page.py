@@ -552,3 +552,22 @@ def test_what_is_too_long_for_a_message_keeps_the_connection(tab):
     tab.until("app.note.textContent.includes('read: 1400')")
     tab.page.wait_for_timeout(700)
     assert tab.app("app.number") == number
+
+
+def test_a_slider_is_dragged_from_end_to_end(chromium):
+    """One of an object whose JSON changes its length meanwhile."""
+    lens = gv.ThinLens(aperture=0.05, focus=2, frame="box")
+    state = gv.ViewState(shader=BANDS, options=gv.RenderOptions(lens=lens))
+    with gv.view(bright_ball(), state=state, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url, viewport={"width": 1000, "height": 900})
+        tab.until("app?.state")
+        for section in ("Colours", "Shader", "Picture"):
+            tab.page.locator(f"summary:text-is('{section}')").click()
+        tab.open("Light and lens")
+        row = tab.page.locator("label.gv-row:has(> .gv-name:text-is('focus'))")
+        box = row.locator("input[type=range]").bounding_box()
+        x, y = box["x"] + box["width"] * 0.3, box["y"] + box["height"] / 2
+        tab.drag((x, y), (x + box["width"] * 0.5, y))
+        tab.until(lambda: viewer.state.options.lens.focus > 4)
+        assert not tab.complaints
+        tab.close()

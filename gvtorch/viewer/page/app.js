@@ -158,15 +158,13 @@ export class App {
 
   change(part, rest = true) {
     if (!this.stateBefore) this.stateBefore = this.state;
-    const layoutKey = (state) => [state.shader.kind, state.options.clip?.planes.length, state.options.lens, state.options.lighting, !state.slices, state.show].map((part) => JSON.stringify(part)?.length);
-    const oldKey = layoutKey(this.state);
     this.state = merged(this.state, part);
     this.link.send("change", { state: part, rest });
     if (rest) {
       this.remember(this.stateBefore, this.state);
       this.stateBefore = null;
+      this.refresh();  // not before: a slider that is dragged would be replaced
     }
-    if (rest || layoutKey(this.state).some((state, n) => state !== oldKey[n])) this.refresh();
     this.view.drawOverlay();
   }
 
