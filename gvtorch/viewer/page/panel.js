@@ -15,9 +15,9 @@ export class Panel {
     this.body = el("div.gv-sections");
     this.element = el("aside.gv-panel", {}, this.body);
     this.outdated = false;  // whether the rows wait to be rebuilt
-    this.edited = null;  // the field with the focus, until its number or text is entered
+    this.edited = null;  // the field with the focus, until its number or text is entered; or the slider that is dragged
     const on = (name, handler, capture = false) => this.element.addEventListener(name, handler, capture);
-    const begin = ({ target }) => { this.edited = ["number", "text"].includes(target.type) ? target : null; };
+    const begin = ({ type, target }) => { this.edited = (type === "input" || ["number", "text"].includes(target.type)) ? target : null; };
     const end = () => { this.edited = null; };
     const catchUp = () => { if (this.outdated) this.show(); };
     on("focusin", begin);
