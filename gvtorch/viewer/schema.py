@@ -22,6 +22,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import numpy as np
 from torch import Tensor
 
+from ..base import check
 from ..base.explicit import option_texts
 from ..pictures import Gradient
 from ..pictures.background import Background
@@ -202,16 +203,11 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
         except _WrongType as error:
             problems.append(str(error))
     expected = " or ".join(dict.fromkeys(problems))
-    raise ValueError(f"{path}: must be {expected}, got {_shortened(content)}")
+    raise ValueError(f"{path}: must be {expected}, got {check.quoted(content)}")
 
 
 class _WrongType(Exception):
     """The content is of another type."""
-
-
-def _shortened(content: Any) -> str:
-    text = repr(content)
-    return text if len(text) < 80 else text[:77] + "..."
 
 
 def _is_named(hint: Any, content: Any) -> bool:
@@ -226,13 +222,10 @@ def _decode_type(path: str, hint: Any, content: Any, current: Any, depth: int) -
         decoded = _decode_sequence(path, hint, content, current, depth)
     elif origin in (dict, Mapping):
         decoded = _decode_mapping(path, hint, content, depth)
+    elif is_class and issubclass(hint, Enum):
+        decoded = hint(_checked_simple(Literal[tuple(member.value for member in hint)], content))
     elif is_class and hint not in (float, *_TYPE_NAMES, type(None), Tensor, np.ndarray):
-        is_enum = issubclass(hint, Enum)
-        decoded = (
-            _decode_enum(hint, content)
-            if is_enum
-            else _decode_object(path, hint, content, current, depth)
-        )
+        decoded = _decode_object(path, hint, content, current, depth)
     else:
         decoded = _checked_simple(hint, content)
     return decoded
@@ -257,13 +250,6 @@ def _checked_simple(hint: Any, content: Any) -> Any:
     elif hint is not Any:
         raise _WrongType("something else")
     return content
-
-
-def _decode_enum(hint: type[Enum], content: Any) -> Enum:
-    names = [member.value for member in hint]
-    if not isinstance(content, str) or content not in names:
-        raise _WrongType(" or ".join(map(repr, names)))
-    return hint(content)
 
 
 def _decode_number(content: Any) -> float:
