@@ -413,6 +413,13 @@ def test_keys_pressed_anew_fly_no_faster(tab):
     assert abs(frames[0] - frames[1]) <= 1, frames
 
 
+def test_a_hand_stops_a_gliding_camera(tab):
+    tab.app("(app.faceAxis(0, 1), app.moveCamera({ ...app.camera, fov: 20 }, false), null)")
+    tab.page.wait_for_timeout(400)
+    assert tab.app("app.camera.fov") == 20
+    tab.final()
+
+
 def test_a_number_that_is_deleted_comes_back(tab, viewer):
     field = number_of(tab, "exposure")
     field.fill("2")

@@ -278,12 +278,15 @@ export class App {
     this.restTimer = setTimeout(() => this.finishMove(), REST_MS);
   }
 
-  /** Moves smoothly to a camera in a quarter of a second. */
+  /** Moves smoothly to a camera in a quarter of a second, unless something else moves it. */
   glide(camera) {
     const from = this.camera, start = performance.now();
+    let last = from;
     const step = (now) => {
+      if (this.camera !== last) return;
       const t = clamp((now - start) / 260, 0, 1);
-      this.moveCamera(t < 1 ? between(from, camera, t * t * (3 - 2 * t)) : camera, t < 1);
+      last = t < 1 ? between(from, camera, t * t * (3 - 2 * t)) : camera;
+      this.moveCamera(last, t < 1);
       if (t < 1) requestAnimationFrame(step);
     };
     step(start);
