@@ -24,7 +24,7 @@ from gvtorch.shaders import Labels
 from gvtorch.viewer import view
 from gvtorch.viewer.scene import Scene
 from gvtorch.viewer.server import Server
-from gvtorch.viewer.state import Eye, Slices, ViewState
+from gvtorch.viewer.state import Development, Eye, Slices, ViewState
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
@@ -374,6 +374,15 @@ def test_a_window_of_slices_may_be_a_list():
     for wrong in ({"window": (1, 2, 3)}, {"window": 5}, {"window": (2, 1)}, {"colors": "blue"}):
         with pytest.raises(ValueError, match=f"Slices: {next(iter(wrong))} must"):
             Slices(**wrong)
+
+
+def test_numbers_of_numpy_and_torch_become_those_of_json():
+    """A picture's message holds the camera's."""
+    eye = Eye(eye=(0, 0, 9), target=(0, 0, 0), fov=np.float32(20))
+    develop = Development(samples=np.int64(4), exposure=torch.tensor(0.5))
+    state = ViewState(shader=FUNCTION, camera=eye, develop=develop, time=np.float32(1), blend=1)
+    kept = (eye.fov, develop.samples, develop.exposure, state.time, state.blend, state.component)
+    assert [type(number) for number in kept] == [float, int, float, float, float, int]
 
 
 @pytest.mark.parametrize("wrong", [{"shader": 5}, {"options": {}}, {"show": "nodez"}])
