@@ -76,7 +76,7 @@ class Slice:
             views = radiological_views(data.info.space) if self.up is None else {}
             span, colors = None, None
             if self.tf is None:
-                text = self.window or "auto"
+                text = "auto" if self.window is None else self.window
                 span = parse_window(text, data, self.component, background=True)
             else:
                 transfer_arguments = self.tf, self.window, data, self.component
