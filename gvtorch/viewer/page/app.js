@@ -1,6 +1,6 @@
 // The page: its copy of the view's state, its parts, and the messages that it handles and sends.
 import { between, distance, facing, MODELS } from "./camera.js";
-import { el, iconButton, saveFile, openJson } from "./dom.js";
+import { el, iconButton, textButton, saveFile, openJson } from "./dom.js";
 import { ClipEditor } from "./clip.js";
 import { Film } from "./film.js";
 import { History } from "./history.js";
@@ -94,8 +94,8 @@ export class App {
       group(iconButton("home", "The whole box (F)", () => this.link.send("do", { what: "fit" })),
         iconButton("ortho", "Orthographic or perspective (O); views along axes: 1 to 6, or a click on x, y, z", () => this.switchOrtho())),
       group(this.slicesButton = iconButton("slices", "Three slices beside the picture", () => this.slices.show(!this.state.slices))),
-      group(iconButton("undo", "Undo (Ctrl Z)", () => this.undo()),
-        iconButton("redo", "Redo (Ctrl Shift Z)", () => this.redo()),
+      group(iconButton("undo", "Undo (Ctrl Z)", () => this.travel("undo")),
+        iconButton("redo", "Redo (Ctrl Shift Z)", () => this.travel("redo")),
         iconButton("camera", "Save the picture (PNG)", () => this.saveStill()),
         iconButton("save", "Save all that is shown (JSON): gvtorch view --state, gvtorch render --state", () => saveFile("view.json", JSON.stringify({ ...this.state, camera: this.camera }, null, 1), "application/json")),
         iconButton("open", "Load what was saved (JSON)", () => openJson((state) => this.load(state), (reason) => this.notify(reason, true)))),
@@ -182,12 +182,9 @@ export class App {
     this.view.drawOverlay();
   }
 
-  undo() {
-    if (!this.history.undo()) this.notify("there is nothing to undo");
-  }
-
-  redo() {
-    if (!this.history.redo()) this.notify("there is nothing to do again");
+  /** Undoes or redoes an edit. */
+  travel(direction) {
+    if (!this.history[direction]()) this.notify(`there is nothing to ${direction}`);
   }
 
   /** Sets a parameter of the scene, or the engine's memory; the answer shows it. */
@@ -346,7 +343,7 @@ export class App {
 
   notify(text, isError = false, retry = null, isSticky = false) {
     clearTimeout(this.noteTimer);
-    this.note.replaceChildren(text, ...(retry ? [el("button.gv-small", { type: "button", onclick: () => { retry(); this.note.classList.remove("gv-shown"); } }, "try again")] : []));
+    this.note.replaceChildren(text, ...(retry ? [textButton("try again", "", () => { retry(); this.note.classList.remove("gv-shown"); })] : []));
     this.note.classList.toggle("gv-bad", isError);
     this.note.classList.add("gv-shown");
     if (!retry && !isSticky) this.noteTimer = setTimeout(() => this.note.classList.remove("gv-shown"), isError ? 7000 : 2200);

@@ -51,6 +51,9 @@ export function iconButton(name, title, onclick) {
   return button;
 }
 
+/** A small button with a text. */
+export const textButton = (text, title, onclick) => el("button.gv-small", { type: "button", title, onclick }, text);
+
 /** Saves a file that the page made. */
 export function saveFile(name, content, type) {
   const url = URL.createObjectURL(new Blob([content], { type }));

@@ -1,5 +1,5 @@
 // The table of labels: the colour of each, and whether it is shown.
-import { el } from "./dom.js";
+import { el, textButton } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
 const MAX_ROWS = 60;  // shown at a time
@@ -36,7 +36,7 @@ export class LabelTable {
   rows() {
     const { labels } = this.app;
     if (this.shader.kind !== "Labels" || !labels) return [];
-    const button = (text, title, visible) => el("button.gv-small", { type: "button", title, onclick: () => this.change({ visible }) }, text);
+    const button = (text, title, visible) => textButton(text, title, () => this.change({ visible }));
     this.fill();
     return [
       el("div.gv-row", {}, el("span.gv-name", {}, `${labels.count} labels`), el("span.gv-both", {}, this.filter,
@@ -66,6 +66,6 @@ export class LabelTable {
       el("input.gv-flag", { type: "checkbox", title: disabled ? "There are too many labels to hide one of them" : "Show it", disabled, checked: this.shows(name), onchange: (event) => this.change({ visible: visibleWith(event.target.checked) }) }),
       el("input.gv-color", { type: "color", title: "Its colour", value: hex(color), oninput: paint(false), onchange: paint(true) }),
       el("span", {}, String(name)), el("span.gv-gap"),
-      el("button.gv-small", { type: "button", title: "Show this one alone", onclick: () => this.change({ visible: [name] }) }, "only"));
+      textButton("only", "Show this one alone", () => this.change({ visible: [name] })));
   }
 }

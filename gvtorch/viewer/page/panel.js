@@ -1,7 +1,7 @@
 // The panel: sections of controls for every part of the state.
 import { Controls, spaced } from "./controls.js";
 import { axes } from "./camera.js";
-import { el } from "./dom.js";
+import { el, textButton } from "./dom.js";
 import { LabelTable } from "./labels.js";
 import { TransferEditor, domain } from "./transfer.js";
 
@@ -137,7 +137,7 @@ export class Panel {
     const { app } = this, { value, kind } = app.state.shader;
     if (kind !== "Isosurface") return null;
     const level = el("input.gv-number", { type: "number", min: 0, step: 1, value: app.surfaceLevel, title: "Level of detail; 0 is the finest, each further one has a quarter of the triangles", onchange: () => { app.surfaceLevel = Math.max(0, Math.round(level.valueAsNumber) || 0); } });
-    const button = (text, format) => el("button.gv-small", { type: "button", title: `The whole surface at this value as a file, not cut: gvtorch surface`, onclick: () => app.saveSurface({ value, format, level: app.surfaceLevel }) }, text);
+    const button = (text, format) => textButton(text, "The whole surface at this value as a file, not cut: gvtorch surface", () => app.saveSurface({ value, format, level: app.surfaceLevel }));
     return el("div.gv-row", {}, el("span.gv-name", {}, "save surface, level"), el("span.gv-both", {}, level, button("PLY", "ply"), button("glTF", "glb")));
   }
 
@@ -166,10 +166,10 @@ export class Panel {
       el("div.gv-row", {}, el("span.gv-name", {}, `plane ${index + 1}`),
         this.controls.number({ type: "number", range: [-0.9, 0.9] }, plane[3], (d, rest) => clip.setPlane(index, [...plane.slice(0, 3), d], rest))),
       el("div.gv-row", {}, el("span.gv-name"), el("span.gv-both", {},
-        el("button.gv-small", { type: "button", title: "Keep the other side", onclick: () => clip.setPlane(index, plane.map((n) => -n), true) }, "turn"),
-        el("button.gv-small", { type: "button", onclick: () => clip.setClip({ ...current, planes: current.planes.filter((_, n) => n !== index) }, true) }, "remove"))),
+        textButton("turn", "Keep the other side", () => clip.setPlane(index, plane.map((n) => -n), true)),
+        textButton("remove", "", () => clip.setClip({ ...current, planes: current.planes.filter((_, n) => n !== index) }, true)))),
     ]);
-    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => clip.addPlane() }, "add one facing me");
+    const facing = textButton("add one facing me", "A plane through the target that faces you", () => clip.addPlane());
     const capRows = current ? this.controls.fields(current, (value, rest) => clip.setClip(value, rest), { only: ["caps", "cap_opacity", "cap_light"] }) : [];
     return [crop, ...planes, el("div.gv-row", {}, el("span.gv-name", {}, "planes"), facing), ...capRows];
   }

@@ -136,8 +136,7 @@ export class Pointer {
     const key = event.key.toLowerCase(), { app } = this, { target } = event;
     if (["number", "text"].includes(target.type)) return;
     if (event.ctrlKey || event.metaKey) {
-      if (key === "z" && event.shiftKey) app.redo();
-      else if (key === "z") app.undo();
+      if (key === "z") app.travel(event.shiftKey ? "redo" : "undo");
       return;
     }
     if (event.altKey || !app.camera || app.panel.element.contains(target)) return;
