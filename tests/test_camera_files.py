@@ -241,6 +241,9 @@ def test_flights_tell_their_cameras_and_render_takes_them(small, tmp_path):
         assert run.returncode == 0, run.stderr
         image, expected = (gv.read_image(tmp_path / file) for file in ("a.png", "f/0001.png"))
         assert (image - expected).abs().max() < 0.02 and image.max() > 0.3
+    stats = ("--camera", camera_flag, "--stats", tmp_path / "t.json")
+    run = gvtorch("render", small, "-o", tmp_path / "a.png", *stats)
+    assert run.returncode == 2 and "would be written over what --camera reads" in run.stderr
     for camera, message in (
         (f"file:{tmp_path / 'model'}", "must name one of 0000.png, 0001.png, 0002.png, got ''"),
         (f"file:{tmp_path / 'no.json'}", "cameras not found"),

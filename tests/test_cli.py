@@ -227,6 +227,8 @@ TF = '{"opacity": [[5, 0], [1, 1]]}'
         (lambda t, s: [s, "--size", "99999x5"], "width must be an int >= 1 and <= 65536"),
         (lambda t, s: [s, "--tf", "lungs"], "unknown preset 'lungs'; known: bone"),
         (lambda t, s: [s, "--tf", "lungs.json"], "transfer function file not found"),
+        (lambda t, s: [s, "--tf", ""], "unknown preset ''"),
+        (lambda t, s: [s, "--window", ""], "--window must be LO,HI, P%,P%, auto or full, got ''"),
         (
             lambda t, s: [s, "--tf", spoiled(t, "tf.json", TF.encode())],
             "opacity values must increase",

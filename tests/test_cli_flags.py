@@ -136,7 +136,8 @@ OWN_KEYS = '[{"eye": [1, 2, 3], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 20}
             lambda t: ["fly", "S", "-o", t / "f", "--orbit", "1,2", "--path", "k.json"],
             "--orbit is for --path orbit",
         ),
-        (lambda t: ["fly", "S", "-o", t / "f", "--orbit", "1"], "--orbit must be 3 numbers"),
+        (lambda t: ["fly", "S", "-o", t / "f", "--orbit", "1"], "--orbit must be AZ,EL or AZ,EL,"),
+        (lambda t: ["fly", "S", "-o", t / "f", "--orbit", "1,2,3,fit"], "--orbit must be AZ,EL or"),
         (
             lambda t: ["fly", "S", "-o", t / "f", "--up", "+z", "--path", keys_file(t, OWN_KEYS)],
             "each key has its own up",
@@ -190,6 +191,7 @@ OWN_KEYS = '[{"eye": [1, 2, 3], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 20}
         (lambda t: ["render", "S", "-o", t / "a.png", "--value", "9"], "--value and --shader iso"),
         (lambda t: ["render", "S", "-o", t / "a.png", "--window", "5,1"], "LO,HI with LO < HI"),
         (lambda t: ["info", "--shape", "1,2,3"], "--shape is for volume files: name one"),
+        (lambda t: ["info", "S", "--shape", ""], "--shape must be 3 whole numbers"),
     ],
 )
 def test_flags_that_would_do_nothing_are_refused(small, scan_store, tmp_path, make, message):

@@ -103,6 +103,7 @@ def test_files_of_every_kind(small, tmp_path, name, bits):
         (["-o", "a.png", "--exposure", "nan"], "exposure must be finite"),
         (["-o", "a.png", "--background", "sky.exr"], "image not found: sky.exr"),
         (["-o", "a.png", "--background", "1,1,1/0"], "--background must be 3 numbers"),
+        (["-o", "a.png", "--background", "sky.tiff"], "path must end in .png, .exr, .npy, .tif"),
         (["-o", "a.png", "--camera-model", "panorama", "--fov", "200"], "fov must be finite"),
     ],
 )

@@ -266,7 +266,8 @@ def test_the_command_line(store, tmp_path):
         shader = gv.Filtered.of(tree, volume, hot, directions=True)
         expected = gv.render(tree, gv.Camera.orbit(20, 10, 9, None, 24, 16), shader)
         np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)
-    done = gvtorch("render", store, "--shader", "filtered", *far, "--tf", "bone")
-    assert done.returncode == 2 and "made with another function" in done.stderr
+    for options in (("--tf", "bone"), ("--window", "3,5")):
+        done = gvtorch("render", store, "--shader", "filtered", *far, *options)
+        assert done.returncode == 2 and "made with another function" in done.stderr
     done = gvtorch("filter", tmp_path / "nothing.zarr")
     assert done.returncode == 2 and done.stderr.count("\n") == 1

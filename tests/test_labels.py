@@ -468,6 +468,7 @@ def test_other_shaders_do_not_blend_labels(scene):
         (lambda: gv.Labels(visible=5), "visible must be labels, 'all' or None, got 5"),
         (lambda: gv.Labels(visible=[2**63]), "whole number below 2^63"),
         (lambda: gv.Labels(reference=0), "reference must be finite and > 0"),
+        (lambda: gv.Labels(lit="no"), "lit must be true or false"),
         (lambda: gv.Labels(normals="n"), "normals are those of the labels"),
         (lambda: gv.Labels(light="sun"), "light must be a Headlight"),
     ],

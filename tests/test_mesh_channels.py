@@ -137,6 +137,8 @@ def test_colours_are_drawn_lit_in_one_line(store, tmp_path):
     assert not np.array_equal(np.load(tmp_path / "b.npy"), np.load(tmp_path / "a.npy"))
     bad = gvtorch("render", store, *flags, tmp_path / "c.npy", "--image", "glow")
     assert bad.returncode == 2 and "has no image 'glow'" in bad.stderr
+    bad = gvtorch("render", store, *flags, tmp_path / "c.npy", "--channel", "0:red")
+    assert bad.returncode == 2 and "--channel is not for" in bad.stderr
 
 
 def test_a_broken_off_store_goes_on_and_is_the_same(tmp_path, mesh, monkeypatch):
@@ -204,3 +206,6 @@ def test_bad_channels_are_told_in_a_line(tmp_path):
         assert run.returncode == 2 and run.stderr.count("\n") == 1, run.stderr
         assert "channels must be some of coverage, distance" in run.stderr
         assert not (tmp_path / "a.zarr").exists()
+    flags = ("-o", tmp_path / "a.zarr", "--texture", "a.png", "--channels", "coverage,normal")
+    run = gvtorch("voxelize", tmp_path / "a.obj", *flags)
+    assert run.returncode == 2 and "--texture is for --channels color" in run.stderr

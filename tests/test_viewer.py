@@ -313,7 +313,8 @@ def test_memory_is_set_while_it_is_looked_at(session):
     page = Page(session)
     _, before = page.final()
     page.send("resize", engine={"brick_pool": "2 MB"})
-    page.until(lambda: session.ask(lambda: session.scene.engine.options.brick_pool) == "2 MB")
+    assert page.next("engine", 0)["engine"]["brick_pool"] == "2 MB"
+    assert session.ask(lambda: session.scene.engine.options.brick_pool) == "2 MB"
     page.moved(turned_camera(page.camera, 0.1))
     _, after = page.moved(page.camera)
     assert np.abs(after.astype(int) - before).max() <= 2

@@ -207,7 +207,7 @@ def test_what_has_no_voxels_has_no_slices(session):
     page = Page(session)
     for wrong, message in (
         ({"position": [1, 2]}, "3 items"),
-        ({"window": [3, 3]}, "a low and a high"),
+        ({"window": [3, 3]}, "window must rise"),
         ({"colors": "red"}, "'gray' or 'shader'"),
     ):
         count = len(page.of_type("refused"))

@@ -24,7 +24,7 @@ from gvtorch.shaders import Labels
 from gvtorch.viewer import view
 from gvtorch.viewer.scene import Scene
 from gvtorch.viewer.server import Server
-from gvtorch.viewer.state import Eye, ViewState
+from gvtorch.viewer.state import Development, Eye, Slices, ViewState
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
@@ -42,6 +42,25 @@ def test_a_state_with_more_items_than_json_may_hold_comes_back(shader):
     changed = state.changed(content)
     assert changed.to_json() == content
     assert changed.shader.visible == shader.visible and changed.shader.colors == shader.colors
+
+
+def test_labels_and_channels_are_saved_with_the_colours_that_they_show():
+    """Names, sRGB arrays and defaults become linear numbers, and sets of labels lists."""
+    for shader in (
+        Labels(np.array([[0, 0, 0], [255, 0, 0]], np.uint8), visible={2, 1}),
+        Labels({1: "#ff0000"}, visible=frozenset((1, 2))),
+    ):
+        content = ViewState(shader=shader).to_json()["shader"]
+        loaded = ViewState(shader=GRAY).changed({"shader": content}).shader
+        assert np.array_equal(loaded(np.arange(4)), shader(np.arange(4)))
+        assert loaded.visible == [1, 2] and loaded(np.array([1]))[0, :3].tolist() == [1, 0, 0]
+    shader = gv.Channels([gv.ChannelLook(window=(0, 1), color="green"),
+                          gv.ChannelLook(window=(0, 1)), GRAY])  # fmt: skip
+    content = ViewState(shader=shader).to_json()["shader"]
+    assert [look["color"] for look in content["looks"]] == [[0, 1, 0], [0, 1, 0], None]
+    loaded = ViewState(shader=GRAY).changed({"shader": content}).shader
+    for n, (look, other) in enumerate(zip(loaded.looks, shader.looks, strict=True)):
+        assert np.array_equal(look.function(n, 3).color, other.function(n, 3).color)
 
 
 def test_a_message_names_the_wrong_label_once():
@@ -128,6 +147,29 @@ class Speed:
 
 def growing(settings: Speed) -> gv.Producer:
     return gv.FieldProducer(Grown(), settings.size, box=CLOCK_BOX)
+
+
+def test_a_time_point_chosen_while_another_fails_is_shown():
+    session, chosen = new_session(bright_ball(), FUNCTION), threading.Event()
+
+    def reopen(time: int) -> gv.Volume:
+        if time == 1:
+            chosen.wait(TIMEOUT)
+            raise OSError("the disk is gone")
+        return bright_ball()
+
+    try:
+        page = Page(session)
+        page.final()
+        session.ask(lambda: vars(session.scene).update(times=3, reopen=reopen))
+        for time_point in (1, 2):
+            page.send("change", state={"time": time_point})
+        page.next("state", 1)
+        chosen.set()
+        assert "time 1: the disk is gone" in page.next("error", 0)["text"]
+        page.until(lambda: page.pictures[-1][0]["time"] == 2)
+    finally:
+        session.close()
 
 
 def test_a_scene_that_is_made_again_keeps_the_time_of_its_clocks():
@@ -323,3 +365,80 @@ def test_wrong_arguments_of_a_server_are_refused(session, options):
 def test_the_state_of_a_view_is_a_file_or_a_state():
     with pytest.raises(ValueError, match="view: state must be a"):
         new_session(bright_ball(8), GRAY, state=5)
+
+
+def test_a_window_of_slices_may_be_a_list():
+    """It is kept as the tuple that it is a key of; other windows and names are refused."""
+    slices = Slices(window=[20, 100])
+    assert slices == Slices(window=(20.0, 100.0)) and hash(slices.window)
+    for wrong in ({"window": (1, 2, 3)}, {"window": 5}, {"window": (2, 1)}, {"colors": "blue"}):
+        with pytest.raises(ValueError, match=f"Slices: {next(iter(wrong))} must"):
+            Slices(**wrong)
+
+
+def test_numbers_of_numpy_and_torch_become_those_of_json():
+    """A picture's message holds the camera's."""
+    eye = Eye(eye=(0, 0, 9), target=(0, 0, 0), fov=np.float32(20))
+    develop = Development(samples=np.int64(4), exposure=torch.tensor(0.5))
+    state = ViewState(shader=FUNCTION, camera=eye, develop=develop, time=np.float32(1), blend=1)
+    kept = (eye.fov, develop.samples, develop.exposure, state.time, state.blend, state.component)
+    assert [type(number) for number in kept] == [float, int, float, float, float, int]
+
+
+@pytest.mark.parametrize("wrong", [{"shader": 5}, {"options": {}}, {"show": "nodez"}])
+def test_a_state_of_something_else_is_refused(wrong):
+    with pytest.raises(ValueError, match=f"ViewState: {next(iter(wrong))} must be"):
+        ViewState(**{"shader": FUNCTION, **wrong})
+
+
+class Waves(gv.Producer):
+    """A producer with parameters of float64, one of them NaN."""
+
+    def __init__(self) -> None:
+        super().__init__(32)
+        self.height = torch.nn.Parameter(torch.tensor(0.5, dtype=torch.float64))
+        self.phase = torch.nn.Parameter(torch.tensor([float("nan"), 1.0]))
+
+    def fill(self, nodes):
+        return nodes.positions[..., :1].sin().float()
+
+
+def test_parameters_keep_their_dtype_and_pages_read_them_whatever_they_are():
+    """JSON has no NaN: a page that is sent one shows nothing."""
+    producer, texts = Waves(), []
+    session = new_session(producer, GRAY)
+    try:
+        session.join(texts.append)
+        page = Page(session)
+        assert page.camera and not any("NaN" in str(text) for text in texts)
+        assert page.of_type("welcome")[0]["parameters"]["phase"]["value"] == [None, 1.0]
+        page.send("set", name="height", value=0.1)
+        page.next("parameters", 0)
+        assert producer.height.item() == 0.1
+    finally:
+        session.close()
+
+
+@dataclass
+class Size:
+    side: int = 16
+
+
+def cube(size: Size) -> gv.Producer:
+    data = np.zeros((size.side,) * 3, np.uint8)
+    data[: size.side // 2] = 200
+    return gv.VolumeProducer(gv.Volume(data))
+
+
+def test_a_scene_of_another_size_has_its_own_box_and_slices():
+    session = new_session(cube, FUNCTION)
+    try:
+        page = Page(session, 200, 160)
+        page.send("change", state={"slices": {"position": [7, 7, 7]}})
+        page.until(lambda: page.pictures and page.pictures[-1][0]["layout"])
+        page.final()
+        page.send("set", name="side", value=32)
+        assert page.next("parameters", 0)["box"] == [[-0.5] * 3, [31.5] * 3]
+        page.until(lambda: page.pictures[-1][0]["layout"]["x"]["columns"][2] == 31.5)
+    finally:
+        session.close()

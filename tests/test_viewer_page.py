@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -346,6 +348,9 @@ def test_channels_and_labels_have_controls(chromium):
         tab.until("app?.state")
         before = tab.final()
         assert before[..., 0].max() > 150 and before[..., 1].max() > 150
+        swatches = tab.page.locator("input.gv-color")
+        values = swatches.evaluate_all("(inputs) => inputs.map((input) => input.value)")
+        assert "#ff0000" in values and "#00ff00" in values
         first = tab.page.locator("div.gv-group:has(> .gv-strong:text-is('tubulin'))")
         first.locator("label.gv-row:has-text('visible') input").uncheck()
         tab.until(lambda: tab.final()[..., 0].max() < 60)
@@ -365,5 +370,217 @@ def test_channels_and_labels_have_controls(chromium):
         row.fill("0.9")
         row.press("Enter")
         tab.until(lambda: viewer.state.shader.ambient == 0.9)
+        assert not tab.complaints
+        tab.close()
+
+
+def number_of(tab: Tab, name: str) -> Any:
+    """Returns the field of a number, by its name in the panel."""
+    return tab.page.locator(f"label.gv-row:has(> .gv-name:text-is('{name}')) input").last
+
+
+def test_a_connection_that_was_lost_goes_on_where_it_was(tab, viewer):
+    """The page keeps its camera and open sections, and gets the picture of its camera."""
+    tab.open("Camera")
+    tab.page.mouse.move(*STAGE)
+    tab.page.mouse.wheel(0, -300)
+    tab.page.wait_for_timeout(300)
+    before, eye = tab.final(), tab.app("app.camera.eye")
+    tab.app("app.view.head = null")
+    server = viewer.server
+    for socket in list(server._sockets):
+        asyncio.run_coroutine_threadsafe(socket.close(), server._loop)
+    after = tab.final()
+    assert tab.app("app.camera.eye") == eye and np.array_equal(after, before)
+    assert number_of(tab, "fov").is_visible()
+
+
+def test_keys_pressed_anew_fly_no_faster(tab):
+    """A key that is released and pressed before the next frame starts no second flight."""
+    frames = tab.page.evaluate("""async () => {
+      const stage = document.querySelector(".gv-stage");
+      const { pointer } = document.querySelector(".gv").app;
+      const fly = pointer.fly.bind(pointer);
+      let calls = 0, frames = 0;
+      pointer.fly = (...times) => { calls += 1; return fly(...times); };
+      for (const type of ["keydown", "keyup", "keydown", "keyup", "keydown"]) {
+        stage.dispatchEvent(new KeyboardEvent(type, { key: "w", bubbles: true }));
+      }
+      for (; frames < 6; frames += 1) await new Promise(requestAnimationFrame);
+      stage.dispatchEvent(new KeyboardEvent("keyup", { key: "w", bubbles: true }));
+      return [calls, frames];
+    }""")
+    assert abs(frames[0] - frames[1]) <= 1, frames
+
+
+def test_a_hand_stops_a_gliding_camera(tab):
+    tab.app("(app.faceAxis(0, 1), app.moveCamera({ ...app.camera, fov: 20 }, false), null)")
+    tab.page.wait_for_timeout(400)
+    assert tab.app("app.camera.fov") == 20
+    tab.final()
+
+
+def test_a_number_that_is_deleted_comes_back(tab, viewer):
+    field = number_of(tab, "exposure")
+    field.fill("2")
+    field.press("Enter")
+    tab.until(lambda: viewer.state.develop.exposure == 2)
+    field.fill("")
+    field.press("Enter")
+    tab.page.wait_for_timeout(200)
+    assert viewer.state.develop.exposure == 2 and field.input_value() == "2"
+
+
+def test_refused_memory_is_shown_as_it_is(tab, viewer, chromium):
+    """What was typed gives way to the memory there is; other pages are told of another one."""
+    tab.open("Memory")
+    pool = number_of(tab, "brick pool")
+    before = pool.input_value()
+    pool.fill("lots")
+    pool.press("Enter")
+    tab.until("app.note.classList.contains('gv-bad')")
+    tab.until(lambda: number_of(tab, "brick pool").input_value() == before)
+    other = Tab(chromium, viewer.url)
+    try:
+        other.until("app?.engine")
+        pool.fill("3 MB")
+        pool.press("Enter")
+        other.until("app.engine.brick_pool === '3 MB'")
+    finally:
+        other.close()
+
+
+def test_only_what_changes_something_is_undone(tab):
+    """Orthographic and back are edits; a click on a point of a function is none."""
+    steps = "app.history.done.length"
+    canvas = tab.page.locator(".gv-tf").bounding_box()
+    x = tab.app("app.panel.editor.x(app.panel.editor.f.opacity[1][0])")
+    y = tab.app("app.panel.editor.y(0.3)")
+    tab.page.mouse.click(canvas["x"] + x, canvas["y"] + y)
+    assert tab.app("app.panel.editor.chosen.index") == 1 and tab.app(steps) == 0
+    tab.page.get_by_label("Orthographic or perspective").click()
+    assert tab.app("app.camera.model") == "ortho" and tab.app(steps) == 1
+    tab.page.get_by_label("Undo").click()
+    assert tab.app("app.camera.model") == "pinhole"
+    tab.final()
+
+
+def test_the_histogram_in_view_is_that_of_the_view(tab):
+    tab.page.get_by_text("in view").click()
+    tab.until("app.panel.editor.histogram.in_view")
+    before = tab.app("app.panel.editor.histogram.counts")
+    tab.page.mouse.move(*STAGE)
+    for _ in range(8):  # inside the ball
+        tab.page.mouse.wheel(0, -300)
+    tab.page.wait_for_timeout(300)
+    tab.final()
+    tab.until(lambda: tab.app("app.panel.editor.histogram.counts") != before)
+
+
+def test_a_scene_without_data_has_the_histogram_of_its_pictures(chromium):
+    ball = gv.FieldProducer(gv.Solid(gv.sdf.Sphere(9)), 32, box=((-10,) * 3, (10,) * 3))
+    with gv.view(ball, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        tab.final()
+        tab.until("app.panel.editor.histogram.in_view")
+        tab.until("app.panel.editor.histogram.counts.some((count) => count > 0)")
+        tab.close()
+
+
+def test_a_handle_moves_the_first_of_several_boxes(chromium):
+    boxes = [((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)), ((-0.4, -0.4, -0.4), (0.4, 0.4, 0.4))]
+    clip = gv.Clip(boxes=boxes, frame="box")
+    with gv.view(bright_ball(), BANDS, clip=clip, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        tab.app("(app.clip.moveFace(0, 1, -4), app.finishEdit(), null)")
+        tab.until(lambda: viewer.state.options.clip.boxes[0][1][0] < 0.45)
+        assert len(viewer.state.options.clip.boxes) == 2
+        tab.close()
+
+
+def test_of_more_labels_than_have_a_row_none_is_hidden_by_another(chromium):
+    """A list of those that are shown could name only those with a row."""
+    names = np.arange(17**3, dtype=np.uint16).reshape(17, 17, 17)
+    with gv.view(gv.Volume(names, labels=True), browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url)
+        tab.until("app?.state")
+        assert tab.page.get_by_text("817 labels above 4095 have no row").is_visible()
+        row = tab.page.locator(".gv-label:has-text('17')").first
+        assert row.locator("input[type=checkbox]").is_disabled()
+        row.get_by_text("only").click()
+        tab.until(lambda: viewer.state.shader.visible == [17])
+        assert row.locator("input[type=checkbox]").is_enabled() and not tab.complaints
+        tab.close()
+
+
+def test_keys_work_wherever_the_focus_is(tab, viewer):
+    """On a fresh page, and beside a slider; in a field, keys are text."""
+    tab.page.keyboard.press("o")
+    tab.until("app.camera.model === 'ortho'")
+    slider = tab.page.locator("label.gv-row:has(> .gv-name:text-is('exposure')) input[type=range]")
+    slider.focus()
+    tab.page.keyboard.press("ArrowRight")
+    tab.until(lambda: viewer.state.develop.exposure > 0)
+    tab.page.keyboard.press("f")
+    tab.page.keyboard.press("Control+z")
+    tab.until(lambda: viewer.state.develop.exposure == 0)
+    number_of(tab, "exposure").focus()
+    tab.page.keyboard.press("Control+z")
+    tab.page.wait_for_timeout(100)
+    assert tab.app("app.camera.model") == "ortho"
+    tab.final()
+
+
+def test_a_picture_that_can_not_be_shown_is_followed_by_others(tab, viewer):
+    head = "{ number: 0, camera: app.camera }"
+    tab.app(f"app.link.emit('picture', {{ head: {head}, bytes: new Uint8Array(9) }})")
+    tab.until("app.note.classList.contains('gv-bad')")
+    number = tab.app("app.view.head.number")
+    tab.page.mouse.move(*STAGE)
+    tab.page.mouse.wheel(0, -200)
+    tab.until(f"app.view.head.number > {number}")
+    tab.final()
+
+
+def test_letters_that_are_not_drawn_are_not_hit(tab):
+    """The letters of the axes, where the camera is no plane."""
+    x, y = tab.app("app.view.axisLetters[0].at.map((number) => number / app.view.ratio)")
+    assert tab.app(f"app.view.axisAt({x}, {y})")
+    tab.app("(app.changeCamera({ ...app.camera, model: 'fisheye' }, true), null)")
+    assert not tab.app(f"app.view.axisAt({x}, {y})")
+    tab.final()
+
+
+def test_what_is_too_long_for_a_message_keeps_the_connection(tab):
+    number = tab.app("app.number")
+    tab.app("app.presets.read('a.json', '\"'.repeat(700000), null)")  # twice as long in JSON
+    tab.until("app.note.textContent.includes('read: 1400')")
+    tab.page.wait_for_timeout(700)
+    assert tab.app("app.number") == number
+
+
+def test_a_slider_is_dragged_from_end_to_end(chromium):
+    """One of an object whose JSON changes its length meanwhile."""
+    lens = gv.ThinLens(aperture=0.05, focus=2, frame="box")
+    state = gv.ViewState(shader=BANDS, options=gv.RenderOptions(lens=lens))
+    with gv.view(bright_ball(), state=state, browser=False, wait=False) as viewer:
+        tab = Tab(chromium, viewer.url, viewport={"width": 1000, "height": 900})
+        tab.until("app?.state")
+        for section in ("Colours", "Shader", "Picture"):
+            tab.page.locator(f"summary:text-is('{section}')").click()
+        tab.open("Light and lens")
+        row = tab.page.locator("label.gv-row:has(> .gv-name:text-is('focus'))")
+        box = row.locator("input[type=range]").bounding_box()
+        x, y = box["x"] + box["width"] * 0.3, box["y"] + box["height"] / 2
+        mouse = tab.page.mouse
+        mouse.move(x, y)
+        mouse.down()
+        mouse.move(x + box["width"] * 0.2, y, steps=4)
+        tab.app("(app.setCamera(app.camera), null)")  # as of a page that is followed
+        mouse.move(x + box["width"] * 0.5, y, steps=4)
+        mouse.up()
+        tab.until(lambda: viewer.state.options.lens.focus > 4)
         assert not tab.complaints
         tab.close()

@@ -232,6 +232,7 @@ def test_the_command(tmp_path, small, scan_store, monkeypatch):
         assert "http://127.0.0.1:" in run.stdout
     assert seen[0]["state"]["options"]["step"] == 0.3
     assert seen[1]["engine"]["brick_pool"] == "4 MB"
+    assert all(text["engine"]["time_budget"] == 40 for text in seen)  # no frame takes long
     assert seen[2]["state"]["shader"]["kind"] == "Isosurface"
     for args, message in (
         ((tmp_path / "no.npy",), "not found"),

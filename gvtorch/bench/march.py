@@ -23,7 +23,7 @@ from ..pool import N3Tree
 from ..tracing import render, trace
 from .peers.peer import Peer, Task, find_peers
 from .record import Record, Settings, Timing, clock, time_once
-from .scenes import SCENES, BenchScene, shell_sparse
+from .scenes import SCENES, BenchScene, made, shell_sparse
 
 _STOP_ALPHA = 0.99
 Size = tuple[int, int]
@@ -41,10 +41,8 @@ def march(record: Record) -> None:
         if not chosen_sizes:
             continue
         record.settings.tell(f"march: making {name}")
-        try:
-            scene = make(32 if quick else 256)
-        except FileNotFoundError:
-            record.note(f"{name}: left out, its file is missing (it comes with the source code)")
+        scene = made(make, 32 if quick else 256, record.note)
+        if scene is None:
             continue
         tree = N3Tree.from_volume(scene.volume, device=record.settings.device)
         for size in chosen_sizes:

@@ -11,7 +11,7 @@ import torch
 
 from ..fields import noise as gv_noise
 from ..ops import noise as noise_op
-from .record import Record, clock, synchronize
+from .record import Record, clock
 
 _CHUNK = 1 << 13  # points at a time, so that NumPy's temporaries stay in the caches
 
@@ -42,14 +42,9 @@ def _measure_perlin(record: Record, case: str, points: torch.Tensor) -> None:
     twin = partial(noise_op, kind="perlin", backend="reference")
     deviation = float((twin(on_device) - gv_noise.perlin(on_device)).abs().max())
     _add(record, case, "twin", len(points), lambda: twin(on_device), max_difference=deviation)
-    compiled = torch.compile(twin, fullgraph=True, dynamic=False)
-    try:
-        compiled(on_device)
-        synchronize(device)
-        _add(record, case, "twin, compiled", len(points), lambda: compiled(on_device))
-    except Exception as error:  # whatever the compiler finds missing here
-        lines = str(error).strip().splitlines()
-        record.note(f"twin: torch.compile fails here: {lines[0] if lines else type(error)}")
+    compiled = record.compiled("twin", lambda: twin(on_device), fullgraph=True)
+    if compiled is not None:
+        _add(record, case, "twin, compiled", len(points), compiled)
     if device.type == "cuda":
         return
     table = np.tile(np.random.default_rng(0).permutation(256), 3)

@@ -24,7 +24,7 @@ from ..producers import (
     Region,
     Regions,
 )
-from .record import Record, clock, synchronize
+from .record import Record, clock
 from .voxelize import bumpy_sphere
 
 _SIDE = 4096  # finest voxels along a side of the scene
@@ -93,7 +93,7 @@ def produce(record: Record) -> None:
 
 
 def random_nodes(producer: Producer, max_count: int, device: torch.device) -> Nodes:
-    """Returns at most `most` random nodes of the finest level that have data."""
+    """Returns at most `max_count` random nodes of the finest level that have data."""
     layout = Layout.of(producer, 8, 1, device)
     producer.prepare(layout)
     generator = torch.Generator().manual_seed(3)
@@ -129,16 +129,10 @@ def _measure(record: Record, case: str, producer: Producer, nodes: Nodes, compil
     _add(record, case, "eager", eager, expected)
     if not compiles:
         return
-    try:
-        settings.tell(f"{case}: compiling")
-        compiled = torch.compile(eager, dynamic=False)
-        compiled()
-        synchronize(settings.device)
-    except Exception as error:  # whatever the compiler finds missing here
-        lines = str(error).strip().splitlines()
-        record.note(f"{case}: torch.compile fails here: {lines[0] if lines else type(error)}")
-        return
-    _add(record, case, "compiled", compiled, expected)
+    settings.tell(f"{case}: compiling")
+    compiled = record.compiled(case, eager)
+    if compiled is not None:
+        _add(record, case, "compiled", compiled, expected)
 
 
 def _add(record: Record, case: str, who: str, run: Callable[[], Tensor], expected: Tensor) -> None:

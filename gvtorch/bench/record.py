@@ -184,6 +184,18 @@ class Record:
         self.peers[name] = why_not or ("ran" if installed else f"not installed ({PEERS[name]})")
         return self.peers[name] == "ran"
 
+    def compiled(self, label: str, run: Callable[[], Any], **options: Any) -> Any:
+        """Returns a function after torch has compiled it; None, with a note, if that fails."""
+        function = torch.compile(run, dynamic=False, **options)
+        try:
+            function()
+            synchronize(self.settings.device)
+        except Exception as error:  # whatever the compiler finds missing here
+            lines = str(error).strip().splitlines()
+            self.note(f"{label}: torch.compile fails here: {lines[0] if lines else type(error)}")
+            return None
+        return function
+
     def note(self, sentence: str) -> None:
         """Adds a sentence to the notes, unless it is there already."""
         if sentence not in self.notes:

@@ -125,14 +125,20 @@ def aneurism(side: int) -> BenchScene:
     return BenchScene(name="aneurism", volume=volume, shader=vessels, surface=76.0)
 
 
-def scan_or_fog(side: int, note: Callable[[str], None] | None = None) -> BenchScene:
-    """Returns the scan; where its file is missing, fog, and calls `note` with the reason."""
+def made(
+    make: Callable[[int], BenchScene], side: int, note: Callable[[str], object]
+) -> BenchScene | None:
+    """Returns the scene that `make` makes; None, after a note, if its file is missing."""
     try:
-        return aneurism(side)
+        return make(side)
     except FileNotFoundError:
-        if note is not None:
-            note("the scan's file is missing (it comes with the source code): fog is used instead")
-        return fog_dense(side)
+        note("aneurism: left out, its file is missing (it comes with the source code)")
+        return None
+
+
+def scan_or_fog(side: int, note: Callable[[str], object] = lambda _: None) -> BenchScene:
+    """Returns the scan; where its file is missing, fog, after a note."""
+    return made(aneurism, side, note) or fog_dense(side)
 
 
 def worn_planes(side: int) -> Iterator[np.ndarray]:

@@ -36,7 +36,7 @@ from ..shaders.built_in import BY_NAME
 from ..tracing import Lighting, trace
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, clock
-from .scenes import BenchScene, aneurism, fog_dense, worn
+from .scenes import BenchScene, aneurism, fog_dense, made, worn
 
 _COMPONENTS = 16  # components of the widest channel
 _USER_HEADER = Path(__file__).with_name("own_shader.h")
@@ -119,10 +119,8 @@ def shaders(record: Record) -> None:
     elif settings.device.type == "cuda":
         size = (1920, 1080)  # fewer rays would not fill the GPU
     for make in (aneurism, fog_dense, worn):  # mostly empty, all sampled, rays that end soon
-        try:
-            scene = make(side)
-        except FileNotFoundError:
-            record.note("aneurism: left out, its file is missing (it comes with the source code)")
+        scene = made(make, side, record.note)
+        if scene is None:
             continue
         volumes = {"value": scene.volume}
         if make is aneurism:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from typing import Any, Literal, Self, TypeVar, Unpack
+from typing import Any, ClassVar, Literal, Self, TypeVar, Unpack
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.checked import Check, flag, optional, positive
 from ..base.image_info import array_from_srgb
 from ..ops.shading import LabelNumbers
 from ..pool import N3Tree
@@ -47,6 +48,7 @@ class Labels(LitShader):
 
     kind = "Labels"
     reads_labels = True
+    checks: ClassVar[Mapping[str, Check]] = {"reference": optional(positive), "lit": flag}
 
     def __init__(
         self,
@@ -105,6 +107,13 @@ class Labels(LitShader):
         rows = np.column_stack((appearance.colors_of(distinct), appearance.opacities(distinct)))
         return rows[inverse.reshape(np.shape(labels))]
 
+    def linear_colors(self) -> Mapping[int, Any] | np.ndarray | None:
+        """Returns the chosen colours as linear RGB: by label, or (k, 3) of labels 0, 1, 2, ..."""
+        appearance = self._appearance()
+        if self.colors is None or isinstance(self.colors, Mapping):
+            return appearance.color_by_label or self.colors
+        return appearance.listed_colors
+
     def own_numbers(self, tree: N3Tree) -> LabelNumbers:
         return LabelNumbers(lit=float(self.lit))
 
@@ -150,8 +159,6 @@ class Labels(LitShader):
 
     def _appearance(self) -> _Appearance:
         """Returns the current colours, opacities and visibility, checked."""
-        if self.reference is not None:
-            check.number("Labels", "reference", self.reference, low=0, open_low=True)
         return _Appearance(self.colors, self.opacity, self.visible)
 
     def _make_table(

@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import tyro
 from tyro.conf import Positional
@@ -65,23 +65,23 @@ class Info:
         else:
             from ..io.reading import MAX_VOXELS, open_source, volume_of
 
-            options = self.source.options()
+            path, options = self.path, self.source.options()
             nan = options.pop("nan")
+
+            def description(**more: Any) -> dict[str, Any]:
+                source = open_source(path, max_values=MAX_VOXELS, **options | more)
+                series = {"times": source.times, "time": source.time} if source.times > 1 else {}
+                return volume_of(source, nan).describe() | series
+
             with Bar() as bar:
                 bar("reading", 0, 0)
-                source = open_source(self.path, max_values=MAX_VOXELS, **options)
                 try:
-                    content = volume_of(source, nan).describe()
+                    content = description()
                 except ValueError as error:
                     if "--labels" not in str(error):
                         raise
                     warnings.warn(f"{error}; shown as labels", stacklevel=2)
-                    source = open_source(
-                        self.path, max_values=MAX_VOXELS, **options | {"labels": True}
-                    )
-                    content = volume_of(source, nan).describe()
-            if source.times > 1:
-                content |= {"times": source.times, "time": source.time}
+                    content = description(labels=True)
         if self.json:
             print(json.dumps(content))
         else:
@@ -142,7 +142,7 @@ class Filter:
     # index of the number that the transfer function reads, for voxels with several
     component: Annotated[int, option(metavar="N")] = 0
     # store normals as well, for --shader filtered-lit
-    lit: bool = False
+    lit: Switch = False
     # store colours for each of six directions, or one mean of them, a sixth of the size; auto: six
     # if a voxel may hide over a fifth of what is behind it
     directions: Literal["auto", "six", "one"] = "auto"
@@ -315,8 +315,13 @@ def main(args: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         if isinstance(error, BrokenPipeError):
             sys.exit(1)
-        print(f"gvtorch: error: standard output: {error.strerror}", file=sys.stderr)
-        sys.exit(2)
+        _fail(f"standard output: {error.strerror}")
+
+
+def _fail(message: str) -> NoReturn:
+    """Reports a mistake of the user in one line, and ends the process."""
+    print(f"gvtorch: error: {message}", file=sys.stderr)
+    sys.exit(2)
 
 
 def _run(args: list[str] | None) -> None:
@@ -330,8 +335,7 @@ def _run(args: list[str] | None) -> None:
         return
     if args and not args[0].startswith("-") and args[0] not in _COMMANDS:
         listing = f"{', '.join(_COMMANDS)}{did_you_mean(args[0], _COMMANDS)}"
-        print(f"gvtorch: error: unknown command {args[0]!r}; known: {listing}", file=sys.stderr)
-        sys.exit(2)
+        _fail(f"unknown command {args[0]!r}; known: {listing}")
     parser_output = io.StringIO()
     try:
         with contextlib.redirect_stderr(parser_output):
@@ -339,12 +343,12 @@ def _run(args: list[str] | None) -> None:
                 _COMMANDS,
                 args=args,
                 prog="gvtorch",
-                description="GigaVoxels on PyTorch tensors.",
+                description="GigaVoxels on PyTorch tensors. --version prints the version.",
                 config=(tyro.conf.CascadeSubcommandArgs,),
             )
     except SystemExit as end:
         if end.code:
-            print(f"gvtorch: error: {_unbox_error(parser_output.getvalue())}", file=sys.stderr)
+            _fail(_unbox_error(parser_output.getvalue()))
         raise
     warnings.showwarning = lambda message, *_rest, **_more: print(
         f"gvtorch: {one_line(message)}", file=sys.stderr
@@ -355,16 +359,13 @@ def _run(args: list[str] | None) -> None:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, ImportError, MemoryError) as error:
-        print(f"gvtorch: error: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        _fail(one_line(error))
     except RuntimeError as error:
         if type(error).__name__ == "ProductionError":
-            print(f"gvtorch: error: {one_line(error)}", file=sys.stderr)
-            sys.exit(2)
+            _fail(one_line(error))
         if "alloc" not in str(error) and "memory" not in str(error):
             raise
-        print(f"gvtorch: error: not enough memory: {one_line(error)}", file=sys.stderr)
-        sys.exit(2)
+        _fail(f"not enough memory: {one_line(error)}")
     except KeyboardInterrupt as interrupt:
         if str(interrupt):
             print(f"gvtorch: {printable(interrupt)}", file=sys.stderr)

@@ -75,9 +75,11 @@ class ReadOptions:
 
     def options(self) -> dict[str, Any]:
         """Returns the options as arguments of `read_volume` and `convert`."""
-        shape = parse_numbers("--shape", self.shape, 3, int) if self.shape else None
-        spacing = parse_numbers("--spacing", self.spacing, 3, float) if self.spacing else None
-        return {**vars(self), "shape": shape, "spacing": spacing}
+        options = dict(vars(self))
+        for name, number_type in (("shape", int), ("spacing", float)):
+            if (text := options[name]) is not None:
+                options[name] = parse_numbers(f"--{name}", text, 3, number_type)
+        return options
 
 
 class Bar:
@@ -160,13 +162,13 @@ def open_data(path: str, options: ReadOptions, *, image: str | None, level: int)
 def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None]) -> None:
     """Raises ValueError if a command would overwrite a file that it reads, or one in a folder that
     it reads, or write a file twice, FileNotFoundError if the folder of an output is missing.
-    `inputs` and `outputs` map flags to paths; a text in `inputs` may also be FILE:NAME, or no path
-    at all.
+    `inputs` and `outputs` map flags to paths; a text in `inputs` may also be FILE:NAME or
+    FILE,NAME, or no path at all.
     """
     input_flags: dict[Path, str] = {}
     for flag, text in inputs.items():
-        for file in (str(text), str(text).rpartition(":")[0]) if text is not None else ():
-            if os.path.exists(file):
+        for file in (str(text), *(str(text).rpartition(separator)[0] for separator in ":,")):
+            if text is not None and os.path.exists(file):
                 input_flags[Path(os.path.realpath(file))] = flag
     output_flags: dict[Path, str] = {}
     for flag, path in outputs.items():
@@ -190,8 +192,9 @@ def parse_numbers(flag: str, text: str, count: int, number_type: type) -> list[A
     except ValueError:
         values = []
     if len(values) != count:
-        noun = "whole numbers" if number_type is int else "numbers"
-        raise ValueError(f"{flag} must be {count} {noun} with commas between them, got {text!r}")
+        noun = "whole number" if number_type is int else "number"
+        wanted = f"a {noun}" if count == 1 else f"{count} {noun}s with commas between them"
+        raise ValueError(f"{flag} must be {wanted}, got {text!r}")
     return values
 
 

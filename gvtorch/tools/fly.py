@@ -17,7 +17,7 @@ from tyro.conf import Positional
 
 from ..base.declared import declared_names
 from ..base.digits import whole_number
-from ..base.messages import one_line, printable
+from ..base.messages import printable
 from ..base.whole_file import write_text
 from ..io.stores.ngff import is_zarr
 from .annotations import Annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..cameras import Camera
     from ..cameras.path import CameraPath
     from ..pictures import Picture, Video
-    from ..viewer.flight import Flight, KeyFile
+    from ..viewer.flight import Flight, KeyFile, StateFile
     from ..viewer.state import ViewState
 
 _FILM_SUFFIXES = tuple(declared_names("pictures.video", "FILM_SIDES"))
@@ -138,16 +138,11 @@ class Fly:
 
     def _loops(self) -> bool:
         """Whether the path ends where it begins, so that its last picture is left out."""
-        return self._bare_flight.closed if self._state_file is not None else self.flight == "orbit"
-
-    @property
-    def _state_file(self) -> Path | None:
-        """The file of states that define the flight: key frames, or one state to circle around."""
-        return self.state if self.keys is None else self.keys
+        return self._bare_flight.closed if self._saved is not None else self.flight == "orbit"
 
     def _stands_still(self) -> bool:
         """Whether the camera stands still: a film over time."""
-        moves = self._state_file is not None or self.turntable is not None or self.flight != "orbit"
+        moves = self._saved is not None or self.turntable is not None or self.flight != "orbit"
         return self.times is not None and not moves
 
     def _picture_taker(
@@ -159,7 +154,7 @@ class Fly:
         look = self.scene.look
         first_camera = parse_camera(None, look, width, height, scene.info.space)
         base_state = replace(scene.state(options), camera=Eye.of(first_camera, scene.box))
-        if self._state_file is None:
+        if self._saved is None:
             path = self._camera_path(scene, width, height)
 
             def render_at(position: float) -> tuple[ViewState, Camera, Picture]:
@@ -168,9 +163,9 @@ class Fly:
                 eye = Eye.of(camera, scene.box) if annotated else base_state.camera
                 return replace(base_state, camera=eye), camera, scene.render(camera)
         else:
-            flight = self._flight_from(base_state)
+            flight = self._saved.flight(base_state)
             for _, state in flight.keys:
-                name = f"{self._state_file}: component"
+                name = f"{self._saved.path}: component"
                 scene.info.check_component(name, state.component, scene.data.width)
 
             def render_at(position: float) -> tuple[ViewState, Camera, Picture]:
@@ -187,35 +182,13 @@ class Fly:
         return take_picture
 
     @cached_property
-    def _key_file(self) -> KeyFile:
-        """The content of --keys, read once: the file may change while pictures are made."""
-        from ..viewer.flight import KeyFile
-
-        assert self.keys is not None
-        return KeyFile(self.keys)
-
-    @cached_property
-    def _first_fields(self) -> dict[str, Any]:
-        """The fields of --state, or of the first state of --keys, unchecked."""
-        from ..viewer.state import saved_state
+    def _saved(self) -> KeyFile | StateFile | None:
+        """The content of --keys or --state, read once: files may change while pictures are made."""
+        from ..viewer.flight import KeyFile, StateFile
 
         if self.keys is not None:
-            return self._key_file.first_fields
-        assert self.state is not None
-        return saved_state(self.state)
-
-    def _flight_from(self, base_state: ViewState) -> Flight:
-        """Returns the flight; `base_state` supplies what its states leave out."""
-        from ..viewer.flight import Flight
-
-        if self.keys is not None:
-            return self._key_file.flight(base_state)
-        fields = self._first_fields
-        try:
-            state = base_state.changed(fields)
-        except ValueError as error:
-            raise ValueError(f"{self.state}: {one_line(error)}") from None
-        return Flight.turntable(state)
+            return KeyFile(self.keys)
+        return None if self.state is None else StateFile(self.state)
 
     @cached_property
     def _bare_flight(self) -> Flight:
@@ -224,12 +197,13 @@ class Fly:
         from ..viewer.state import Eye, ViewState
 
         placeholder = Eye(eye=(0, 0, 1), target=(0, 0, 0))
-        return self._flight_from(ViewState(shader=TransferFunction([(0, 1)]), camera=placeholder))
+        assert self._saved is not None
+        return self._saved.flight(ViewState(shader=TransferFunction([(0, 1)]), camera=placeholder))
 
     def _time_parts(self, frames: int) -> list[tuple[int | None, range]]:
         """Returns time points and the numbers of their pictures; None: the one of --time."""
         if self.times is None:
-            return [(None, range(frames))] if self._state_file is None else self._key_parts(frames)
+            return [(None, range(frames))] if self._saved is None else self._key_parts(frames)
         times = self._selected_times()
         ends = [-(-number * frames // len(times)) for number in range(len(times) + 1)]
         return [(t, range(a, b)) for t, a, b in zip(times, ends, ends[1:], strict=False) if a < b]
@@ -247,7 +221,8 @@ class Fly:
         if not 0 <= min(times) <= max(times) < count:
             time = next(t for t in times if not 0 <= t < count)
             raise ValueError(
-                f"{self._state_file}: time must be from 0 to {count - 1} of {self.path}, got {time}"
+                f"{self.keys or self.state}: time must be from 0 to {count - 1} of {self.path}, "
+                f"got {time}"
             )
         starts = [n for n in range(frames) if n == 0 or times[n] != times[n - 1]]
         return [(times[a], range(a, b)) for a, b in pairwise((*starts, frames))]
@@ -308,7 +283,7 @@ class Fly:
 
     def _check_path(self) -> None:
         """Raises ValueError for a wrong path before the volume is read."""
-        if self._state_file is not None:
+        if self._saved is not None:
             self._check_states()
         elif self.flight != "orbit":
             if self.orbit is not None:
@@ -325,7 +300,7 @@ class Fly:
         if not is_folder and self.poses.suffix != ".json":
             raise ValueError(f"--poses must be a folder or end in .json, got {self.poses}")
         models = [self.scene.look.camera_model]
-        if self._state_file is not None:
+        if self._saved is not None:
             models = [s.camera.model for _, s in self._bare_flight.keys if s.camera is not None]
         unsupported = next((model for model in models if model not in ("pinhole", "fisheye")), None)
         if unsupported is not None:
@@ -341,7 +316,8 @@ class Fly:
         flags = [name for name, value in flag_values.items() if value]
         if self.times is not None and any(state.time != 0 for _, state in flight.keys):
             flags.append("--times")
-        self.scene.look.check_state(self._state_flag, self._first_fields, flags)
+        assert self._saved is not None
+        self.scene.look.check_state(self._state_flag, self._saved.first_fields, flags)
 
     @property
     def _state_flag(self) -> str:

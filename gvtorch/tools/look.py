@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..cameras.models import CameraModel
     from ..cameras.poses import Up
     from ..io.stores.store import Store
-    from ..shaders import Shader, StoredColor
+    from ..shaders import Shader
 
     ShaderName = str
 else:
@@ -198,18 +198,7 @@ class Look:
             raise ValueError(f"--up must be +x, -x, +y, -y, +z, -z or X,Y,Z, got {self.up!r}")
         return parse_numbers("--up", self.up, 3, float)
 
-    def stored_color_shader(self, store: Store, names: tuple[str, ...]) -> StoredColor:
-        """Returns the shader of a mesh's stored colours, and of its normals if `names` has them."""
-        from ..shaders import StoredColor
-
-        self._refuse_flags("colours are stored", "component")
-        # An opaque voxel must be opaque within its own width: light enters no farther.
-        options: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
-        if len(names) == 1:
-            return StoredColor("value", lit=True, **options)
-        return StoredColor("color", normals="normal", **options)
-
-    def _refuse_flags(self, reason: str, *more_names: str) -> None:
+    def refuse_flags(self, reason: str, *more_names: str) -> None:
         """Raises ValueError if a flag of transfer functions, or one of `more_names`, is given."""
         for name in ("tf", "window", "value", *more_names):
             if getattr(self, name) != getattr(Look(), name):
@@ -223,14 +212,14 @@ class Look:
         from ..shaders.built_in import BY_NAME
 
         if self.shader == "channels":
-            self._refuse_flags("it takes --channel", "component")
+            self.refuse_flags("it takes --channel", "component")
             return parse_channels(self.channel, data)
         if self.channel is not None:
             raise ValueError("--channel is for --shader channels")
         if self.shader == "colors":
             raise ValueError("--shader colors is for stores of meshes: --channels color,normal")
         if self.shader == "labels" or (self.shader == "plain" and data.info.labels):
-            self._refuse_flags("labels have colours of their own")
+            self.refuse_flags("labels have colours of their own")
             data.info.check_component("--component", self.component, data.width)
             return Labels()
         if (self.value is None) == (self.shader == "isosurface"):
@@ -265,11 +254,12 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
     """Returns azimuth, elevation and distance of AZ,EL, AZ,EL,fit or AZ,EL,DIST; the distance is
     None if the whole box is to be in the picture. Raises ValueError for any other text.
     """
-    if text.count(",") == 1 or text.endswith(",fit"):
-        azimuth, elevation = parse_numbers(flag, text.removesuffix(",fit"), 2, float)
-        return azimuth, elevation, None
-    azimuth, elevation, distance = parse_numbers(flag, text, 3, float)
-    return azimuth, elevation, distance
+    numbers = text.removesuffix(",fit")
+    count = numbers.count(",") + 1
+    if count not in (2, 3) or (count == 3 and numbers != text):
+        raise ValueError(f"{flag} must be AZ,EL or AZ,EL,DIST, got {text!r}")
+    azimuth, elevation, *distance = parse_numbers(flag, numbers, count, float)
+    return azimuth, elevation, distance[0] if distance else None
 
 
 def up_and_front(space: str | None) -> tuple[Up, float]:

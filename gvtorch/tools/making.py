@@ -89,11 +89,14 @@ class Voxelize:
         from ..io.stores.store import Store
 
         start = time.perf_counter()
+        channels = tuple(name.strip() for name in self.channels.split(","))
+        if self.texture is not None and "color" not in channels:
+            raise ValueError("--texture is for --channels color")
         with self.conversion.arguments(speed=True) as store_options:
             store = voxelize(
                 *(self.path, self.output),
                 resolution=self.resolution,
-                channels=tuple(name.strip() for name in self.channels.split(",")),
+                channels=channels,
                 band=self.band,
                 thickness=self.thickness,
                 solid=self.solid,
@@ -140,6 +143,8 @@ class Splat:
         from ..io.point_source import splat
 
         start = time.perf_counter()
+        if self.channels == "value" and (self.opacity != Splat.opacity or self.colors is not None):
+            raise ValueError("--opacity and --colors are for --channels color")
         with self.conversion.arguments() as store_options:
             store = splat(
                 self.path,

@@ -37,7 +37,7 @@ def parse_transfer(
     from ..shaders.presets import CT_PRESETS, IN_HU
 
     data.info.check_component("--component", component, data.width)
-    name = name or "gray"
+    name = "gray" if name is None else name
     file, _, preset = name.rpartition(":")
     if Path(name).is_file() or name.endswith(_TRANSFER_SUFFIXES):
         transfer = TransferFunction.from_file(name)
@@ -52,7 +52,8 @@ def parse_transfer(
         transfer.relative = True
     if window_text is None and not transfer.relative:
         return transfer
-    values = parse_window(window_text or "auto", data, component, background=background)
+    text = "auto" if window_text is None else window_text
+    values = parse_window(text, data, component, background=background)
     return transfer.stretched(*values)
 
 
@@ -183,7 +184,7 @@ def parse_background(text: str) -> Any:
 
     if text == "transparent":
         return None
-    if Path(text).suffix in (".png", ".exr", ".npy", ".tif"):
+    if Path(text).suffix[1:].isalpha():
         return Environment.read(text)
     top, slash, bottom = text.partition("/")
     if slash:

@@ -135,8 +135,10 @@ class Render:
             if self.output.suffix in STRIP_SUFFIXES:
                 raise ValueError(f"--npz holds a whole picture: not with {self.output.suffix}")
             checked_path("--npz", self.npz, suffixes=(".npz",))
+        camera = (self.camera or "").removeprefix("file:")
+        inputs = {"PATH": self.path, "--state": self.state, "--camera": camera}
         check_outputs(
-            {"PATH": self.path, "--state": self.state, **self.scene.look.files()},
+            {**inputs, **self.scene.look.files()},
             {"--output": self.output, "--npz": self.npz, "--stats": self.stats},
         )
         if self.show != "picture":

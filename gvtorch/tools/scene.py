@@ -128,7 +128,8 @@ class SceneFlags:
         mode = streaming.mode or "converge"
         if mode != "converge" and limit != Streaming().max_frames:
             raise ValueError(f"--max-frames is for --mode converge, not {mode}")
-        producer, shader = streaming.producer_and_shader(store, self.look)
+        shader = streaming.shader(store, self.look)
+        producer = streaming.producer(store, shader)
         with Engine(producer, **streaming.engine_options(self.look, store)) as engine:
             (tree,) = (source.tree for source in engine.trees.values())
             yield RenderedScene(

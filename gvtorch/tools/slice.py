@@ -10,7 +10,15 @@ import tyro
 from tyro.conf import Positional
 
 from ..base.messages import printable
-from .common import Bar, ReadOptions, check_outputs, open_data, option, volume_formats
+from .common import (
+    Bar,
+    ReadOptions,
+    Switch,
+    check_outputs,
+    open_data,
+    option,
+    volume_formats,
+)
 from .parse import parse_transfer, parse_window
 
 
@@ -33,7 +41,7 @@ class Slice:
     up: Annotated[str | None, option(metavar="+z")] = None
     # leave out the letters at the edges (R right, L left, A front, P back, S head, I feet) of scans
     # of patients, which are shown as radiologists view them: the right side on the left
-    plain: bool = False
+    plain: Switch = False
     # pixels along the shortest side of a voxel
     scale: Annotated[float, option(metavar="PIXELS")] = 1.0
     # level of detail of a store; 0 is the finest
@@ -68,7 +76,7 @@ class Slice:
             views = radiological_views(data.info.space) if self.up is None else {}
             span, colors = None, None
             if self.tf is None:
-                text = self.window or "auto"
+                text = "auto" if self.window is None else self.window
                 span = parse_window(text, data, self.component, background=True)
             else:
                 transfer_arguments = self.tf, self.window, data, self.component

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..engine import Engine, FrameStats
     from ..io.stores.store import Store
     from ..producers import Producer
-    from ..shaders import Shader
+    from ..shaders import Shader, StoredColor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,43 +60,54 @@ class Streaming:
             )
         return store
 
-    def _mesh_channels(self, store: Store, look: Look) -> tuple[str, ...]:
-        """Returns the stored channels of a mesh that are drawn directly: color, and normal if there
-        is one for lighting; none if the flags choose another shader.
+    def _mesh_shader(self, store: Store, look: Look) -> StoredColor | None:
+        """Returns the shader of a mesh's stored colours, lit by its normals if they are stored too;
+        None if the store has none, or the flags choose another shader.
         """
         from ..io.stores.channels import channel_names
+        from ..shaders import StoredColor
 
         if look.shader not in ("plain", "colors") or look.tf is not None:
-            return ()
+            return None
         if store.info.quantity != "color" or store.width != 4:
-            return ()
-        folder = store.location.rpartition("/")[0]
-        has_normals = self.image is None and "normal" in channel_names(folder)
-        return ("color", "normal") if has_normals else ("color",)
+            return None
+        look.refuse_flags("colours are stored", "component", "channel")
+        # An opaque voxel must be opaque within its own width: light enters no farther.
+        options: dict[str, Any] = {"reference": 0.3 * min(store.spacing), "premultiplied": True}
+        if self.image is None and "normal" in channel_names(store.location.rpartition("/")[0]):
+            return StoredColor("color", normals="normal", **options)
+        return StoredColor("value", lit=True, **options)
 
-    def producer_and_shader(self, store: Store, look: Look) -> tuple[Producer, Shader]:
-        """Returns the producer that streams a store, and the shader."""
-        from ..producers import StoredChannels, StoredProducer
+    def shader(self, store: Store, look: Look) -> Shader:
+        """Returns the shader that shows a store."""
         from ..shaders import Filtered, Lit
 
-        names = self._mesh_channels(store, look)
-        shader = look.stored_color_shader(store, names) if names else look.make_shader(store)
-        filtered = shader if isinstance(shader, Filtered) else None
-        if filtered is not None and look.tf is None:
+        shader = self._mesh_shader(store, look) or look.make_shader(store)
+        if not isinstance(shader, Filtered):
+            return shader
+        if look.tf is None and look.window is None:
             stored = Filtered.stored(store)
-            if stored.numbers != filtered.numbers:
+            if stored.numbers != shader.numbers:
                 shader_flags = "--shader filtered" + "-lit" * isinstance(stored.transfer, Lit)
                 raise ValueError(
                     f"{store.location}: its filtered colours are for {shader_flags}; "
                     "gvtorch filter, with --lit or without, makes others"
                 )
-            shader = filtered = stored
-        if filtered is not None and filtered.component != look.component:
-            raise ValueError(f"--component must be that of the colours, {filtered.component}")
-        if len(names) > 1:
+            shader = stored
+        if shader.component != look.component:
+            raise ValueError(f"--component must be that of the colours, {shader.component}")
+        return shader
+
+    def producer(self, store: Store, shader: Shader) -> Producer:
+        """Returns the producer that streams a store for its shader."""
+        from ..producers import StoredChannels, StoredProducer
+        from ..shaders import Filtered, StoredColor
+
+        if isinstance(shader, StoredColor) and shader.normals is not None:
             folder = store.location.rpartition("/")[0]
-            return StoredChannels(folder, names, host_cache=self.host_cache), shader
-        return StoredProducer(store, host_cache=self.host_cache, filtered=filtered), shader
+            return StoredChannels(folder, shader.channels, host_cache=self.host_cache)
+        filtered = shader if isinstance(shader, Filtered) else None
+        return StoredProducer(store, host_cache=self.host_cache, filtered=filtered)
 
     def engine_options(self, look: Look, data: Volume | Store) -> dict[str, Any]:
         """Returns fields of `EngineOptions`."""

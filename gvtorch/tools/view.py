@@ -16,9 +16,7 @@ from .look import parse_camera
 from .scene import SceneFlags
 
 if TYPE_CHECKING:
-    from ..base.volume import Volume
     from ..cameras import Camera
-    from ..io.stores.store import Store
     from ..producers import Producer
     from ..shaders import Shader
     from ..viewer.scene import Scene
@@ -93,39 +91,35 @@ class View:
 
     def _make_scene(self, flags: SceneFlags) -> tuple[Scene, Shader]:
         """Returns the scene of a page, at a time point, and its shader."""
-        from ..engine.engine import Engine
+        from ..base.volume import Volume
         from ..producers import VolumeProducer
         from ..shaders import Filtered
-        from ..viewer.scene import Scene, series_of
+        from ..viewer.scene import series_of, streamed_scene
 
         look, streaming = flags.look, flags.streaming
         given = given_flags(streaming)
         for flag in ("--mode", "--max-frames"):
             if flag in given:
                 raise ValueError(f"{flag} is for single pictures: a page refines its own")
-        data: Volume | Store
         if is_zarr(self.path):
-            data = store = flags.open_store(self.path)
-            producer, shader = streaming.producer_and_shader(store, look)
-
-            def remake(data: Any) -> Producer:
-                return streaming.producer_and_shader(data, look)[0]
-
-            series = series_of(store)
+            data: Any = flags.open_store(self.path)
+            shader = streaming.shader(data, look)
+            series = series_of(data)
         else:
             store_flags = [flag for flag in given if flag in ("--image", "--host-cache")]
             refuse_store_flags(self.path, store_flags)
             data = flags.source.read(self.path)
             shader = look.make_shader(data)
-            filtered = shader if isinstance(shader, Filtered) else None
-
-            def remake(data: Any) -> Producer:
-                return VolumeProducer(data, threshold=flags.threshold, filtered=filtered)
-
-            producer = remake(data)
             series = series_of(self.path, **flags.source.options())
-        engine = Engine(producer, **streaming.engine_options(look, data))
-        return Scene(data.name, engine, data=data, remake=remake, **series), shader
+        filtered = shader if isinstance(shader, Filtered) else None
+
+        def remake(data: Any) -> Producer:
+            if isinstance(data, Volume):
+                return VolumeProducer(data, threshold=flags.threshold, filtered=filtered)
+            return streaming.producer(data, shader)
+
+        options = streaming.engine_options(look, data)
+        return streamed_scene(data, remake, series, **options), shader
 
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         import runpy

@@ -190,15 +190,37 @@ class _SavedKey(NamedTuple):
     path: Path | None  # the state's own file
 
 
+class StateFile:
+    """A saved state, read once, for a flight once around its target.
+
+    Attributes:
+        path: The file.
+        first_fields: The fields of the state, unchecked.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Reads the file; see `saved_state`."""
+        self.path, self.first_fields = path, saved_state(path)
+
+    def flight(self, now: ViewState) -> Flight:
+        """Returns the flight; `now` supplies what the state leaves out."""
+        return Flight.turntable(now.changed(self.first_fields, self.path))
+
+
 class KeyFile:
-    """The content of a file of key frames and of the state files that it names, read once."""
+    """The content of a file of key frames and of the state files that it names, read once.
+
+    Attributes:
+        path: The file.
+        first_fields: The fields of the first key's state, unchecked.
+    """
 
     def __init__(self, path: str | Path) -> None:
         """Reads the files; see `Flight.read`."""
         content = check.json_file("key frames", path)
         if not isinstance(content, list) or not content:
             raise ValueError(f'{path}: must be a list of keys {{"time": ..., "state": ...}}')
-        self._path = path
+        self.path = path
         self._keys: list[_SavedKey] = []
         for n, key in enumerate(content):
             if not isinstance(key, dict) or set(key) != {"time", "state"}:
@@ -210,11 +232,7 @@ class KeyFile:
             except ValueError as error:
                 raise ValueError(f"{path}: key {n}: {one_line(error)}") from None
             self._keys.append(_SavedKey(key["time"], fields, state_path))
-
-    @property
-    def first_fields(self) -> dict[str, Any]:
-        """The fields of the first key's state, unchecked."""
-        return self._keys[0].fields
+        self.first_fields: dict[str, Any] = self._keys[0].fields
 
     def flight(self, now: ViewState) -> Flight:
         """Returns the flight; `now` supplies what the first state leaves out. ValueError: a key or
@@ -222,17 +240,13 @@ class KeyFile:
         """
         keys = []
         for n, key in enumerate(self._keys):
-            label = f"{self._path}: key {n}"
-            try:
-                now = now.changed(key.fields)
-            except ValueError as error:
-                label = label if key.path is None else f"{label}: {key.path}"
-                raise ValueError(f"{label}: {one_line(error)}") from None
+            label = f"{self.path}: key {n}"
+            now = now.changed(key.fields, label if key.path is None else f"{label}: {key.path}")
             keys.append((check.number(f"{label}: Flight", "time", key.time), now))
         try:
             return Flight(keys)
         except ValueError as error:
-            raise ValueError(f"{self._path}: {one_line(error)}") from None
+            raise ValueError(f"{self.path}: {one_line(error)}") from None
 
 
 def _pose(eye: Eye) -> Tensor:

@@ -72,7 +72,7 @@ class Parameters:
         for name, tensor in self._tensors().items():
             kind = "number" if tensor.numel() == 1 else "numbers"
             value = tensor.item() if tensor.numel() == 1 else tensor.flatten().tolist()
-            descriptions[name] = {"type": kind, "value": value}
+            descriptions[name] = {"type": kind, "value": encode(value)}
         return descriptions or None
 
     def _tensors(self) -> dict[str, torch.nn.Parameter]:
@@ -96,7 +96,7 @@ class Parameters:
             if len(decoded) != tensors[name].numel():
                 raise ValueError(f"set: {name} has {tensors[name].numel()} numbers")
             with torch.no_grad():
-                tensors[name].copy_(torch.tensor(decoded).view_as(tensors[name]))
+                tensors[name].copy_(tensors[name].new_tensor(decoded).view_as(tensors[name]))
             self.producer.changed()
             return
         field_names = [] if self.record is None else [field.name for field in fields(self.record)]

@@ -148,13 +148,15 @@ class Scene:
 
     def histogram(self, component: int, in_view: bool) -> dict[str, Any]:
         """Counts the values of the bricks that the last frame read, or of a sample of all values.
-        Returns low, high, and at most BINS counts.
+        Returns in_view (whether they are of those bricks, as all are if `data` is None), low,
+        high, and at most BINS counts.
         """
-        values = self._values_in_view(component) if in_view or self.data is None else None
+        in_view = in_view or self.data is None
+        values = self._values_in_view(component) if in_view else None
         if values is None and self.data is not None:
             values = sample_values(self.data)[..., component].ravel()
         if values is None or not len(values):
-            return {"low": 0.0, "high": 1.0, "counts": [0] * BINS}
+            return {"in_view": in_view, "low": 0.0, "high": 1.0, "counts": [0] * BINS}
         low, high = float(values.min()), float(values.max())
         high = high if high > low else low + 1.0
         bins = BINS
@@ -164,7 +166,7 @@ class Scene:
             low, bins = low - gap / 2, math.ceil((high - low + gap) / width)
             high = low + bins * width
         counts, _ = np.histogram(values, bins, (low, high))
-        return {"low": low, "high": high, "counts": counts.tolist()}
+        return {"in_view": in_view, "low": low, "high": high, "counts": counts.tolist()}
 
     def _values_in_view(self, component: int) -> np.ndarray | None:
         tree = self.trees[0]
@@ -310,10 +312,19 @@ def open_scene(what: Any, **options: Any) -> Scene:
         return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
     if isinstance(what, Producer):
         return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
-    data, series = _open_data(what), series_of(what)
+    data = _open_data(what)
     options.setdefault("border", data.info.default_border)
-    engine = Engine(_producer_of(data), **options)
-    return Scene(data.name, engine, data=data, remake=_producer_of, **series)
+    return streamed_scene(data, _producer_of, series_of(what), **options)
+
+
+def streamed_scene(
+    data: Volume | Store, remake: Remake, series: dict[str, Any], **options: Any
+) -> Scene:
+    """Returns the scene of a volume or a store, which is one of a series (see `series_of`);
+    `options` are fields of `EngineOptions`.
+    """
+    engine = Engine(remake(data), **{"time_budget": _BUDGET_MS, **options})
+    return Scene(data.name, engine, data=data, remake=remake, **series)
 
 
 def _producer_of(data: Volume | Store | None) -> Producer:

@@ -14,14 +14,15 @@ import inspect
 import itertools
 import math
 import types
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import MISSING, fields, is_dataclass, replace
 from enum import Enum
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from torch import Tensor
 
+from ..base import check
 from ..base.explicit import option_texts
 from ..pictures import Gradient
 from ..pictures.background import Background
@@ -56,6 +57,13 @@ _ARGUMENT_READERS: dict[tuple[str, str], Any] = {
     ("Features", "channel"): lambda shader: shader.other,
     ("Gradient", "top"): lambda gradient: gradient.ends[0],
     ("Gradient", "bottom"): lambda gradient: gradient.ends[1],
+    ("Labels", "colors"): lambda labels: labels.linear_colors(),
+    ("Channels", "looks"): lambda channels: [
+        replace(look, color=look.function(n, len(channels.looks)).color[-1, 1:])
+        if look.transfer is None
+        else look
+        for n, look in enumerate(channels.looks)
+    ],
 }
 #: Arguments that no control changes: they belong to the scene, not to its look.
 _SCENE_ARGUMENTS = {
@@ -125,6 +133,8 @@ def encode(value: Any) -> Any:
             max(value.shape, default=0) <= MAX_ITEMS and math.prod(value.shape) <= _MAX_NUMBERS
         )
         value = value.tolist() if is_small else _kept_marker(value)
+    elif isinstance(value, Set):
+        value = sorted(value)
     if isinstance(value, float):
         value = value if math.isfinite(value) else None
     elif isinstance(value, (Mapping, list, tuple, range)) and len(value) > MAX_ITEMS:
@@ -193,16 +203,11 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
         except _WrongType as error:
             problems.append(str(error))
     expected = " or ".join(dict.fromkeys(problems))
-    raise ValueError(f"{path}: must be {expected}, got {_shortened(content)}")
+    raise ValueError(f"{path}: must be {expected}, got {check.quoted(content)}")
 
 
 class _WrongType(Exception):
     """The content is of another type."""
-
-
-def _shortened(content: Any) -> str:
-    text = repr(content)
-    return text if len(text) < 80 else text[:77] + "..."
 
 
 def _is_named(hint: Any, content: Any) -> bool:
@@ -217,13 +222,10 @@ def _decode_type(path: str, hint: Any, content: Any, current: Any, depth: int) -
         decoded = _decode_sequence(path, hint, content, current, depth)
     elif origin in (dict, Mapping):
         decoded = _decode_mapping(path, hint, content, depth)
+    elif is_class and issubclass(hint, Enum):
+        decoded = hint(_checked_simple(Literal[tuple(member.value for member in hint)], content))
     elif is_class and hint not in (float, *_TYPE_NAMES, type(None), Tensor, np.ndarray):
-        is_enum = issubclass(hint, Enum)
-        decoded = (
-            _decode_enum(hint, content)
-            if is_enum
-            else _decode_object(path, hint, content, current, depth)
-        )
+        decoded = _decode_object(path, hint, content, current, depth)
     else:
         decoded = _checked_simple(hint, content)
     return decoded
@@ -248,13 +250,6 @@ def _checked_simple(hint: Any, content: Any) -> Any:
     elif hint is not Any:
         raise _WrongType("something else")
     return content
-
-
-def _decode_enum(hint: type[Enum], content: Any) -> Enum:
-    names = [member.value for member in hint]
-    if not isinstance(content, str) or content not in names:
-        raise _WrongType(" or ".join(map(repr, names)))
-    return hint(content)
 
 
 def _decode_number(content: Any) -> float:

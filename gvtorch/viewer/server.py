@@ -9,6 +9,7 @@ site is refused even if that site's name is made to point here (DNS rebinding).
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import ipaddress
 import logging
@@ -226,7 +227,7 @@ class Server:
                 queue.put_nowait(None)  # the page does not keep up
 
         def send(data: str | bytes) -> None:
-            if not loop.is_closed():
+            with contextlib.suppress(RuntimeError):  # the loop is closed
                 loop.call_soon_threadsafe(enqueue, data)
 
         async def send_queued() -> None:

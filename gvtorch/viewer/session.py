@@ -244,6 +244,13 @@ class Session:
     def _state_content(self) -> dict[str, Any]:
         return {"state": self.state.to_json(), "unfit": unfit(self.state)}
 
+    def _engine_content(self) -> dict[str, Any] | None:
+        """Returns the options of the engine that a page may set; None if the caller owns it."""
+        engine = self.scene.engine
+        if engine is None or self.scene.remake is None:
+            return None
+        return {name: encode(getattr(engine.options, name)) for name in _ENGINE_OPTIONS}
+
     def _broadcast_busy(self, picture: Picture) -> None:
         stats = picture.stats
         busy = {
@@ -284,7 +291,6 @@ class Session:
     def _welcome(self, client: Client) -> None:
         self.clients[client.number] = client
         box, info = self.scene.box.tolist(), self.scene.info
-        engine = self.scene.engine
         client.send_message(
             "welcome",
             client=client.number,
@@ -304,9 +310,7 @@ class Session:
                 for name, model in MODELS.items()
             },
             presets=[*PRESETS, *CT_PRESETS, *_COLOR_MAPS],
-            engine=None
-            if engine is None or self.scene.remake is None
-            else {name: encode(getattr(engine.options, name)) for name in _ENGINE_OPTIONS},
+            engine=self._engine_content(),
             parameters=None if self.parameters is None else self.parameters.describe(),
         )
         self._broadcast_clients()
@@ -433,19 +437,25 @@ class Session:
         except Exception as error:  # whatever it was, the view goes on
             self._time_failed(time_point, error)
             return
+        self._show_new_data()
+        self._update_time()
+
+    def _show_new_data(self) -> None:
+        """Restarts pictures and planes, of the scene's present data."""
+        self._restart_pictures()
         if self._planes is not None:
             self._planes.close()
             self._planes = None
             self._open_planes(self.state)
-        self._restart_pictures()
-        self._update_time()
 
     def _time_failed(self, time_point: float, error: Exception) -> None:
-        """Sets the state back to the time that is shown."""
+        """Sets the state back to the time that is shown, unless it wants another one meanwhile."""
         self._pending_time = None
-        self.state = replace(self.state, time=self.scene.time)
         self._broadcast("error", text=f"time {time_point:g}: {one_line(error)}")
-        self._broadcast_state(None)
+        if self.state.time == time_point:
+            self.state = replace(self.state, time=self.scene.time)
+            self._broadcast_state(None)
+        self._update_time()
 
     def _take_pick(self, client: Client, message: protocol.Pick) -> None:
         position = client.position_at(message.x, message.y)
@@ -453,7 +463,7 @@ class Session:
 
     def _take_histogram(self, client: Client, message: protocol.Histogram) -> None:
         histogram = self.scene.histogram(self.state.component, message.in_view)
-        client.send_message("histogram", in_view=message.in_view, **histogram)
+        client.send_message("histogram", **histogram)
 
     def _take_preset(self, client: Client, message: protocol.Preset) -> None:
         name = message.name
@@ -493,6 +503,7 @@ class Session:
             raise ValueError("resize: the scene is resident")
         options = decode("engine", EngineOptions, message.engine, self.scene.engine.options)
         self.scene.resize(**{name: getattr(options, name) for name in message.engine})
+        self._broadcast("engine", engine=self._engine_content())
         self._restart_pictures()
 
     def _restart_pictures(self, resting: bool = True) -> None:
@@ -503,8 +514,9 @@ class Session:
         if self.parameters is None:
             raise ValueError("set: there are no parameters")
         self.parameters.set(message.name, message.value, self.scene)
-        self._broadcast("parameters", parameters=self.parameters.describe())
-        self._restart_pictures()
+        box = self.scene.box.tolist()
+        self._broadcast("parameters", parameters=self.parameters.describe(), box=box)
+        self._show_new_data()
 
     def _take_follow(self, client: Client, message: protocol.Follow) -> None:
         leader = self.clients.get(message.client or 0)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor
@@ -26,6 +26,7 @@ from ..pictures import Picture, Progressive
 from ..pictures.tone import ToneCurve, checked_curve
 from ..pool import N3Tree
 from ..shaders import Shader, TransferFunction
+from ..shaders.channels import window_of
 from ..tracing import Cost, RenderOptions, render
 from .schema import decode, encode
 
@@ -33,6 +34,12 @@ Triple = tuple[float, float, float]
 _MAX_COORDINATE = 1e30  # largest coordinate, so that a ray's numbers stay finite
 _MIN_DISTANCE = 1e-100  # from eye to target, so that its square does not become 0
 Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
+
+
+def _set(record: Any, **checked: Any) -> None:
+    """Sets fields of a frozen record to what their checks returned."""
+    for name, value in checked.items():
+        object.__setattr__(record, name, value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +63,8 @@ class Eye:
 
     def __post_init__(self) -> None:
         for name in ("eye", "target", "up"):
-            object.__setattr__(self, name, check.triple("Eye", name, getattr(self, name)))
-        model_of("Eye", self.model).checked_fov("Eye", self.fov)
+            _set(self, **{name: check.triple("Eye", name, getattr(self, name))})
+        _set(self, fov=model_of("Eye", self.model).checked_fov("Eye", self.fov))
         if max(abs(number) for number in (*self.eye, *self.target, *self.up)) > _MAX_COORDINATE:
             raise ValueError(f"Eye: eye, target and up must be at most {_MAX_COORDINATE:g}")
         if math.dist(self.eye, self.target) < _MIN_DISTANCE or not any(self.up):
@@ -139,8 +146,9 @@ class Development:
     exposure: float = 0.0
 
     def __post_init__(self) -> None:
-        check.integer("Development", "samples", self.samples, low=1, high=65536)
-        checked_curve("Development", self.tone, self.exposure)
+        samples = check.integer("Development", "samples", self.samples, low=1, high=65536)
+        exposure = checked_curve("Development", self.tone, self.exposure)
+        _set(self, samples=samples, exposure=exposure)
 
     def develop(self, picture: Picture) -> Picture:
         """Returns the picture with its light mapped to the display."""
@@ -172,14 +180,10 @@ class Slices:
 
     def __post_init__(self) -> None:
         if self.position is not None:
-            position = check.triple("Slices", "position", self.position)
-            object.__setattr__(self, "position", position)
+            _set(self, position=check.triple("Slices", "position", self.position))
         if self.window is not None:
-            low, high = (check.number("Slices", "window", value) for value in self.window)
-            if not low < high:
-                raise ValueError(
-                    f"Slices: window must be a low and a high value, got {low}, {high}"
-                )
+            _set(self, window=window_of("Slices", self.window))
+        check.one_of("Slices", "colors", self.colors, ("gray", "shader"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,12 +213,17 @@ class ViewState:
     camera: Eye | None = None
 
     def __post_init__(self) -> None:
-        check.integer("ViewState", "component", self.component, low=0)
-        check.number("ViewState", "blend", self.blend, low=0, high=1)
-        check.number("ViewState", "time", self.time)
+        check.instance("ViewState", "shader", self.shader, Shader)
+        check.instance("ViewState", "options", self.options, RenderOptions)
+        check.one_of("ViewState", "show", self.show, get_args(Show))
+        _set(
+            self,
+            component=check.integer("ViewState", "component", self.component, low=0),
+            blend=check.number("ViewState", "blend", self.blend, low=0, high=1),
+            time=check.number("ViewState", "time", self.time),
+        )
         if self.component != self.options.component:
-            options = replace(self.options, component=self.component)
-            object.__setattr__(self, "options", options)
+            _set(self, options=replace(self.options, component=self.component))
 
     @property
     def is_plain(self) -> bool:
@@ -279,14 +288,18 @@ class ViewState:
         """Returns the state as plain values, ready for JSON."""
         return encode(self)
 
-    def changed(self, content: Any) -> ViewState:
+    def changed(self, content: Any, source: str | Path = "") -> ViewState:
         """Returns the state with the fields of plain JSON in place of its own; fields that it
         leaves out, or marks as kept, stay.
 
         Raises:
-            ValueError: A field is unknown, or a value out of its range.
+            ValueError: A field is unknown, or a value out of its range; the message begins with
+                `source`, where the JSON comes from.
         """
-        return decode("state", ViewState, content, self)
+        try:
+            return decode("state", ViewState, content, self)
+        except ValueError as error:
+            raise ValueError(f"{source}: {one_line(error)}" if source else str(error)) from None
 
     def save(self, path: str | Path) -> None:
         """Writes a .json file."""
@@ -302,11 +315,7 @@ class ViewState:
             FileNotFoundError: There is no such file.
             ValueError: It holds something else; the message names it.
         """
-        content = saved_state(path)
-        try:
-            return self.changed(content)
-        except ValueError as error:
-            raise ValueError(f"{path}: {one_line(error)}") from None
+        return self.changed(saved_state(path), path)
 
 
 def transfer_of(shader: Shader) -> TransferFunction | None:

@@ -1,6 +1,6 @@
 // The page: its copy of the view's state, its parts, and the messages that it handles and sends.
 import { between, distance, facing, MODELS } from "./camera.js";
-import { el, iconButton, saveFile, openJson } from "./dom.js";
+import { el, iconButton, textButton, saveFile, openJson } from "./dom.js";
 import { ClipEditor } from "./clip.js";
 import { Film } from "./film.js";
 import { History } from "./history.js";
@@ -39,6 +39,7 @@ export class App {
     this.root = root;
     this.tool = "orbit";
     this.surfaceLevel = 0;
+    this.open = new Set(["Colours", "Shader", "Picture"]);  // sections of the panel
     this.overlays = { axes: true, scale: true, box: false, nodes: false };
     this.history = new History();
     this.clients = {};
@@ -69,17 +70,18 @@ export class App {
     on("nodes", (message) => this.nodes.receive(message));
     on("note", ({ text }) => this.notify(text));
     on("picked", (message) => this.picked(message));
-    on("parameters", ({ parameters }) => { this.parameters = parameters; this.refresh(); this.askHistogram(this.inView); });
+    on("parameters", ({ parameters, box }) => { Object.assign(this, { parameters, box }); this.refresh(); this.view.drawOverlay(); this.askHistogram(this.inView); });
+    on("engine", ({ engine }) => { this.engine = engine; this.refresh(); });
     on("busy", (busy) => this.busy(busy));
     on("figures", (figures) => this.monitor.receive(figures));
     on("exporting", ({ done, total }) => this.notify(`making the surface … ${Math.round((100 * done) / total)} %`, false, null, true));
-    on("refused", ({ text }) => this.notify(text, true));
-    on("error", ({ text }) => this.notify(text, true));
+    for (const type of ["refused", "error"]) on(type, ({ text }) => { this.notify(text, true); this.refresh(); });
     on("failed", ({ text, count }) => this.notify(`${count} parts could not be loaded: ${text}`, true, () => this.link.send("do", { what: "retry" })));
     on("gone", ({ reason }) => { this.notify(reason || "The view is gone; trying to reach it again …", true); this.root.classList.add("gv-lost"); });
     this.view.element.addEventListener("drawn", ({ detail }) => {
       this.monitor.drawn();
       this.times.drawn(detail);
+      if (detail.final && this.panel?.editor.histogram?.in_view) this.askHistogram(this.inView);
     });
   }
 
@@ -92,8 +94,8 @@ export class App {
       group(iconButton("home", "The whole box (F)", () => this.link.send("do", { what: "fit" })),
         iconButton("ortho", "Orthographic or perspective (O); views along axes: 1 to 6, or a click on x, y, z", () => this.switchOrtho())),
       group(this.slicesButton = iconButton("slices", "Three slices beside the picture", () => this.slices.show(!this.state.slices))),
-      group(iconButton("undo", "Undo (Ctrl Z)", () => this.undo()),
-        iconButton("redo", "Redo (Ctrl Shift Z)", () => this.redo()),
+      group(iconButton("undo", "Undo (Ctrl Z)", () => this.travel("undo")),
+        iconButton("redo", "Redo (Ctrl Shift Z)", () => this.travel("redo")),
         iconButton("camera", "Save the picture (PNG)", () => this.saveStill()),
         iconButton("save", "Save all that is shown (JSON): gvtorch view --state, gvtorch render --state", () => saveFile("view.json", JSON.stringify({ ...this.state, camera: this.camera }, null, 1), "application/json")),
         iconButton("open", "Load what was saved (JSON)", () => openJson((state) => this.load(state), (reason) => this.notify(reason, true)))),
@@ -119,7 +121,8 @@ export class App {
     const { camera, ...state } = message.state;
     this.state = state;
     this.unfit = message.unfit;
-    this.camera ??= camera;
+    if (this.camera) this.sendCamera(false);  // a new connection
+    else this.camera = camera;
     this.home = camera;
     this.title.textContent = message.name;
     document.title = this.root.classList.contains("gv-page") ? `${message.name} · gvtorch` : document.title;
@@ -132,7 +135,6 @@ export class App {
     this.refresh();
     this.askHistogram(false);
     if (this.overlays.nodes) this.nodes.show(true);
-    if (this.panel.open.has("Monitor")) this.setMonitor(true);
   }
 
   refresh() {
@@ -156,20 +158,19 @@ export class App {
 
   change(part, rest = true) {
     if (!this.stateBefore) this.stateBefore = this.state;
-    const layoutKey = (state) => [state.shader.kind, state.options.clip?.planes.length, state.options.lens, state.options.lighting, !state.slices, state.show].map((part) => JSON.stringify(part)?.length);
-    const oldKey = layoutKey(this.state);
     this.state = merged(this.state, part);
     this.link.send("change", { state: part, rest });
     if (rest) {
       this.remember(this.stateBefore, this.state);
       this.stateBefore = null;
+      this.refresh();  // not before: a slider that is dragged would be replaced
     }
-    if (rest || layoutKey(this.state).some((state, n) => state !== oldKey[n])) this.refresh();
     this.view.drawOverlay();
   }
 
-  /** Adds an edit of the state to the history. */
+  /** Adds an edit of the state to the history, unless it changed nothing. */
   remember(before, after) {
+    if (JSON.stringify(before) === JSON.stringify(after)) return;
     this.history.push(() => this.replaceState(before), () => this.replaceState(after));
   }
 
@@ -181,32 +182,23 @@ export class App {
     this.view.drawOverlay();
   }
 
-  undo() {
-    if (!this.history.undo()) this.notify("there is nothing to undo");
+  /** Undoes or redoes an edit. */
+  travel(direction) {
+    if (!this.history[direction]()) this.notify(`there is nothing to ${direction}`);
   }
 
-  redo() {
-    if (!this.history.redo()) this.notify("there is nothing to do again");
-  }
-
-  /** Sets a parameter of the scene, or the engine's memory. */
-  setValue(type, values, name, value, message) {
-    const before = type === "set" ? values[name].value : values[name];
-    const apply = (newValue) => {
-      if (type === "resize") values[name] = newValue;
-      this.link.send(type, message(newValue));
-      this.refresh();
-    };
+  /** Sets a parameter of the scene, or the engine's memory; the answer shows it. */
+  setValue(type, before, value, message) {
+    const apply = (newValue) => this.link.send(type, message(newValue));
     this.history.push(() => apply(before), () => apply(value));
     apply(value);
   }
 
+  /** Loads a saved state; the answer shows it, and sets the camera. */
   load(state) {
-    const { camera: _, ...rest } = state, before = this.state;
-    this.link.send("change", { state, rest: true });  // the answer sets the camera
-    this.state = merged(this.state, rest);
-    this.remember(before, this.state);
-    this.refresh();
+    const before = this.state, send = (content) => this.link.send("change", { state: content, rest: true });
+    this.history.push(() => this.replaceState(before), () => send({ ...state, camera: undefined }));
+    send(state);
   }
 
   // Colours.
@@ -275,7 +267,7 @@ export class App {
 
   finishMove() {
     this.sendCamera(false);
-    if (this.panel?.open.has("Camera")) this.refresh();
+    if (this.open.has("Camera")) this.refresh();
   }
 
   finishMoveSoon() {
@@ -283,12 +275,15 @@ export class App {
     this.restTimer = setTimeout(() => this.finishMove(), REST_MS);
   }
 
-  /** Moves smoothly to a camera in a quarter of a second. */
+  /** Moves smoothly to a camera in a quarter of a second, unless something else moves it. */
   glide(camera) {
     const from = this.camera, start = performance.now();
+    let last = from;
     const step = (now) => {
+      if (this.camera !== last) return;
       const t = clamp((now - start) / 260, 0, 1);
-      this.moveCamera(t < 1 ? between(from, camera, t * t * (3 - 2 * t)) : camera, t < 1);
+      last = t < 1 ? between(from, camera, t * t * (3 - 2 * t)) : camera;
+      this.moveCamera(last, t < 1);
       if (t < 1) requestAnimationFrame(step);
     };
     step(start);
@@ -309,7 +304,7 @@ export class App {
   }
 
   switchOrtho() {
-    this.moveCamera({ ...this.camera, model: this.camera.model === "ortho" ? "pinhole" : "ortho" }, false);
+    this.changeCamera({ ...this.camera, model: this.camera.model === "ortho" ? "pinhole" : "ortho" }, true);
     this.refresh();
   }
 
@@ -348,7 +343,7 @@ export class App {
 
   notify(text, isError = false, retry = null, isSticky = false) {
     clearTimeout(this.noteTimer);
-    this.note.replaceChildren(text, ...(retry ? [el("button.gv-small", { type: "button", onclick: () => { retry(); this.note.classList.remove("gv-shown"); } }, "try again")] : []));
+    this.note.replaceChildren(text, ...(retry ? [textButton("try again", "", () => { retry(); this.note.classList.remove("gv-shown"); })] : []));
     this.note.classList.toggle("gv-bad", isError);
     this.note.classList.add("gv-shown");
     if (!retry && !isSticky) this.noteTimer = setTimeout(() => this.note.classList.remove("gv-shown"), isError ? 7000 : 2200);

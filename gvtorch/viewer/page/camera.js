@@ -21,23 +21,21 @@ export const halfHeight = (c) => distance(c) * Math.tan(((Math.min(c.fov, 170) /
 /** The same at a depth along the axis. */
 export const halfHeightAt = (c, depth) => (MODELS[c.model].parallel ? halfHeight(c) : (depth * halfHeight(c)) / distance(c));
 
+/** Turns a vector around the camera's up by -yaw, and around the axis `right` towards the pole by pitch (radians). */
+function swung(c, vector, right, yaw, pitch) {
+  const pole = unit(c.up), angle = Math.acos(clamp(dot(unit(vector), pole), -1, 1));  // from the pole
+  const tilt = clamp(angle - pitch, 0.02, Math.PI - 0.02) - angle;
+  return turned(turned(vector, right, tilt), pole, -yaw);
+}
+
 /** Orbits the target by angles (radians) to the right and up. */
 export function orbited(c, yaw, pitch) {
-  const pole = unit(c.up), away = sub(c.eye, c.target);
-  const { right } = axes(c);
-  const angle = Math.acos(clamp(dot(unit(away), pole), -1, 1));  // from the pole
-  const tilt = clamp(angle - pitch, 0.02, Math.PI - 0.02) - angle;
-  const lifted = turned(away, right, tilt);
-  return { ...c, eye: add(c.target, turned(lifted, pole, -yaw)) };
+  return { ...c, eye: add(c.target, swung(c, sub(c.eye, c.target), axes(c).right, yaw, pitch)) };
 }
 
 /** Turns the view direction by angles (radians), from the same position. */
 export function lookedAround(c, yaw, pitch) {
-  const pole = unit(c.up), towards = sub(c.target, c.eye);
-  const { right } = axes(c);
-  const angle = Math.acos(clamp(dot(unit(towards), pole), -1, 1));
-  const tilt = clamp(angle - pitch, 0.02, Math.PI - 0.02) - angle;
-  return { ...c, target: add(c.eye, turned(turned(towards, right, -tilt), pole, -yaw)) };
+  return { ...c, target: add(c.eye, swung(c, sub(c.target, c.eye), times(axes(c).right, -1), yaw, pitch)) };
 }
 
 export function shifted(c, move) {

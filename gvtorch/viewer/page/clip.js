@@ -82,7 +82,7 @@ export class ClipEditor {
     const moved = box[side][axis] + amount * scale;
     const limit = app.box.map((point) => (this.inWorld ? point : this.toBox(point))[axis]);
     box[side][axis] = side ? clamp(moved, box[0][axis] + minThickness, limit[1]) : clamp(moved, limit[0], box[1][axis] - minThickness);
-    this.setClip({ ...clip, boxes: [box] }, false);
+    this.setClip({ ...clip, boxes: [box, ...clip.boxes.slice(1)] }, false);
   }
 
   /** Draws boxes and planes; returns their handles. */

@@ -1,5 +1,5 @@
 // Controls made from the schema: each by the type and range of a field, whatever its class.
-import { el } from "./dom.js";
+import { el, textButton } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
 /** The name of a field or a class in words: "cap_light" is "cap light", "PointLight" is "Point light". */
@@ -72,12 +72,13 @@ export class Controls {
 
   number(field, value, set) {
     const isInteger = field.type === "whole";
-    const parse = (text) => (text === "" && field.optional ? null : isInteger ? Math.round(Number(text)) : Number(text));
-    const input = el("input.gv-number", { type: "number", step: "any", value: typeof value === "number" ? Number(value.toPrecision(6)) : "", placeholder: field.optional ? "auto" : "" });
+    const parse = (text) => (text === "" ? (field.optional ? null : NaN) : isInteger ? Math.round(Number(text)) : Number(text));
+    const shown = typeof value === "number" ? Number(value.toPrecision(6)) : "";
+    const input = el("input.gv-number", { type: "number", step: "any", value: shown, placeholder: field.optional ? "auto" : "" });
     let slider = null;
     input.onchange = () => {
       const number = parse(input.value);
-      if (number !== null && !Number.isFinite(number)) return;
+      if (number !== null && !Number.isFinite(number)) { input.value = shown; return; }
       if (slider && number !== null) slider.value = number;
       set(number, true);
     };
@@ -138,8 +139,8 @@ export class Controls {
     const replaceItem = (index, item, rest) => set(items.map((old, n) => (n === index ? item : old)), rest);
     const rows = items.map((item, index) => el("div.gv-inner", {},
       this.group(`${index + 1}`, field.items, item, (next, rest) => replaceItem(index, next, rest)) ?? "",
-      el("button.gv-small", { type: "button", onclick: () => set(items.filter((_, n) => n !== index), true) }, "remove")));
-    const addButton = el("button.gv-small", { type: "button", onclick: () => set([...items, this.newObject(kinds[kinds.length > 1 ? 1 : 0].kind, name)], true) }, "add");
+      textButton("remove", "", () => set(items.filter((_, n) => n !== index), true))));
+    const addButton = textButton("add", "", () => set([...items, this.newObject(kinds[kinds.length > 1 ? 1 : 0].kind, name)], true));
     return el("div.gv-group", { title: field.text ?? "" }, el("div.gv-row", {}, el("span.gv-name", {}, spaced(name)), addButton), ...rows);
   }
 }

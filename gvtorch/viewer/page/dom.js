@@ -42,9 +42,6 @@ export const ICONS = {
   save: "M12 4v11M8 11l4 4 4-4M4 20h16",
   open: "M12 15V4M8 8l4-4 4 4M4 20h16",
   panel: "M4 5h16v14H4zM15 5v14",
-  monitor: "M3 12h4l3-7 4 14 3-7h4",
-  close: "M6 6l12 12M18 6L6 18",
-  plus: "M12 5v14M5 12h14",
 };
 
 /** A button with an icon. */
@@ -53,6 +50,9 @@ export function iconButton(name, title, onclick) {
   button.append(icon(ICONS[name]));
   return button;
 }
+
+/** A small button with a text. */
+export const textButton = (text, title, onclick) => el("button.gv-small", { type: "button", title, onclick }, text);
 
 /** Saves a file that the page made. */
 export function saveFile(name, content, type) {

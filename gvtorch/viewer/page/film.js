@@ -1,5 +1,5 @@
 // Key frames: states of this page, each at a time, in the format of `gvtorch fly --keys`.
-import { el, iconButton, saveFile, openJson } from "./dom.js";
+import { el, iconButton, textButton, saveFile, openJson } from "./dom.js";
 
 const KEY_SPACING = 2;  // seconds from a key to the next
 
@@ -13,13 +13,12 @@ export class Film {
   rows() {
     const keys = this.keys.map((key, index) => {
       const time = el("input", { type: "number", min: 0, step: 0.5, value: key.time, title: "Seconds", onchange: () => this.move(index, time.valueAsNumber) });
-      const button = (text, title, onclick) => el("button.gv-small", { type: "button", title, onclick }, text);
       return el("div.gv-row", {}, el("span.gv-name", {}, `key ${index + 1}`), el("span.gv-both", {}, time,
-        button("show", "Show this key", () => this.app.load(key.state)),
-        button("remove", "Remove this key", () => this.setKeys(this.keys.filter((otherKey) => otherKey !== key)))));
+        textButton("show", "Show this key", () => this.app.load(key.state)),
+        textButton("remove", "Remove this key", () => this.setKeys(this.keys.filter((otherKey) => otherKey !== key)))));
     });
     return [...keys, el("div.gv-bar", {},
-      el("button.gv-small", { type: "button", title: "What is shown now, after the last key", onclick: () => this.add() }, "add this view"),
+      textButton("add this view", "What is shown now, after the last key", () => this.add()),
       el("span.gv-gap"),
       this.keys.length ? iconButton("save", "Save the keys (JSON): gvtorch fly --keys", () => saveFile("keys.json", JSON.stringify(this.keys, null, 1), "application/json")) : null,
       iconButton("open", "Load keys that were saved (JSON)", () => openJson((keys) => this.load(keys), (reason) => this.app.notify(reason, true))))];

@@ -1,5 +1,5 @@
 // The table of labels: the colour of each, and whether it is shown.
-import { el } from "./dom.js";
+import { el, textButton } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
 const MAX_ROWS = 60;  // shown at a time
@@ -30,13 +30,13 @@ export class LabelTable {
 
   shows(name) {
     const { visible } = this.shader;
-    return visible === null ? name !== 0 : visible === "all" || visible.includes(name);
+    return visible === null ? name !== 0 : (Array.isArray(visible) ? visible.includes(name) : true);
   }
 
   rows() {
     const { labels } = this.app;
     if (this.shader.kind !== "Labels" || !labels) return [];
-    const button = (text, title, visible) => el("button.gv-small", { type: "button", title, onclick: () => this.change({ visible }) }, text);
+    const button = (text, title, visible) => textButton(text, title, () => this.change({ visible }));
     this.fill();
     return [
       el("div.gv-row", {}, el("span.gv-name", {}, `${labels.count} labels`), el("span.gv-both", {}, this.filter,
@@ -49,8 +49,9 @@ export class LabelTable {
     const { names, colors, count } = this.app.labels, { chosen } = this;
     const matches = names.map((_, n) => n).filter((n) => String(names[n]).includes(this.search));
     const rows = matches.slice(0, MAX_ROWS).map((n) => this.row(names[n], chosen[names[n]] ?? colors[n]));
-    const remaining = matches.length - rows.length + (count - names.length);
-    this.body.replaceChildren(...rows, ...(remaining ? [el("div.gv-dim", {}, `${remaining} more: find them by number`)] : []));
+    const note = (n, text) => (n ? [el("div.gv-dim", {}, `${n} ${text}`)] : []);
+    this.body.replaceChildren(...rows, ...note(matches.length - rows.length, "more: find them by number"),
+      ...note(count - names.length, `labels above ${names.at(-1)} have no row`));
   }
 
   row(name, color) {
@@ -59,11 +60,12 @@ export class LabelTable {
       const shown = this.app.labels.names.filter((label) => this.shows(label) && label !== name);
       return on ? [...shown, name].sort((a, b) => a - b) : shown;
     };
-    const value = Array.isArray(color) ? hex(color) : color;
+    const { visible } = this.shader, { names, count } = this.app.labels;
+    const disabled = count > names.length && !Array.isArray(visible);  // a list would hide those without a row
     return el("div.gv-row.gv-label", {},
-      el("input.gv-flag", { type: "checkbox", title: "Show it", checked: this.shows(name), onchange: (event) => this.change({ visible: visibleWith(event.target.checked) }) }),
-      el("input.gv-color", { type: "color", title: "Its colour", value, oninput: paint(false), onchange: paint(true) }),
+      el("input.gv-flag", { type: "checkbox", title: disabled ? "There are too many labels to hide one of them" : "Show it", disabled, checked: this.shows(name), onchange: (event) => this.change({ visible: visibleWith(event.target.checked) }) }),
+      el("input.gv-color", { type: "color", title: "Its colour", value: hex(color), oninput: paint(false), onchange: paint(true) }),
       el("span", {}, String(name)), el("span.gv-gap"),
-      el("button.gv-small", { type: "button", title: "Show this one alone", onclick: () => this.change({ visible: [name] }) }, "only"));
+      textButton("only", "Show this one alone", () => this.change({ visible: [name] })));
   }
 }

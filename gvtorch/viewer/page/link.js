@@ -1,5 +1,7 @@
 // The messages: texts, passed on by their type, and pictures and files, which come as bytes.
 
+const MAX_BYTES = 2 ** 20;  // of a message, above which the server would end the connection
+
 export class Link {
   /** `connect(receive, onLost)` opens a transport and returns the function that sends a text. */
   constructor(connect) {
@@ -16,7 +18,9 @@ export class Link {
   }
 
   send(type, content = {}) {
-    this.post(JSON.stringify({ type, ...content }));
+    const text = JSON.stringify({ type, ...content }), { size } = new Blob([text]);
+    if (size > MAX_BYTES) this.emit("refused", { text: `${type}: ${size} bytes, more than ${MAX_BYTES}` });
+    else this.post(text);
   }
 
   receive(data) {

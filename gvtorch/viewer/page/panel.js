@@ -1,14 +1,13 @@
 // The panel: sections of controls for every part of the state.
 import { Controls, spaced } from "./controls.js";
 import { axes } from "./camera.js";
-import { el } from "./dom.js";
+import { el, textButton } from "./dom.js";
 import { LabelTable } from "./labels.js";
 import { TransferEditor, domain } from "./transfer.js";
 
 export class Panel {
   constructor(app) {
     this.app = app;
-    this.open = new Set(["Colours", "Shader", "Picture"]);
     this.controls = new Controls(app.schema, (kind, name) => this.newObject(kind, name), () => ({ ...app.unfit, ...this.unfit }));
     this.unfit = unfitColours(app.widths);
     this.editor = new TransferEditor((f, rest) => app.changeTransfer(f, rest));
@@ -16,9 +15,9 @@ export class Panel {
     this.body = el("div.gv-sections");
     this.element = el("aside.gv-panel", {}, this.body);
     this.outdated = false;  // whether the rows wait to be rebuilt
-    this.edited = null;  // the field with the focus, until its number or text is entered
+    this.edited = null;  // the field with the focus, until its number or text is entered; or the slider that is dragged
     const on = (name, handler, capture = false) => this.element.addEventListener(name, handler, capture);
-    const begin = ({ target }) => { this.edited = ["number", "text"].includes(target.type) ? target : null; };
+    const begin = ({ type, target }) => { this.edited = (type === "input" || ["number", "text"].includes(target.type)) ? target : null; };
     const end = () => { this.edited = null; };
     const catchUp = () => { if (this.outdated) this.show(); };
     on("focusin", begin);
@@ -57,8 +56,8 @@ export class Panel {
   section(name, ...rows) {
     const shown = rows.flat().filter(Boolean);
     if (!shown.length) return null;
-    const element = el("details.gv-section", { open: this.open.has(name) }, el("summary", {}, name), ...shown);
-    element.addEventListener("toggle", () => (element.open ? this.open.add(name) : this.open.delete(name)));
+    const element = el("details.gv-section", { open: this.app.open.has(name) }, el("summary", {}, name), ...shown);
+    element.addEventListener("toggle", () => (element.open ? this.app.open.add(name) : this.app.open.delete(name)));
     return element;
   }
 
@@ -138,7 +137,7 @@ export class Panel {
     const { app } = this, { value, kind } = app.state.shader;
     if (kind !== "Isosurface") return null;
     const level = el("input.gv-number", { type: "number", min: 0, step: 1, value: app.surfaceLevel, title: "Level of detail; 0 is the finest, each further one has a quarter of the triangles", onchange: () => { app.surfaceLevel = Math.max(0, Math.round(level.valueAsNumber) || 0); } });
-    const button = (text, format) => el("button.gv-small", { type: "button", title: `The whole surface at this value as a file, not cut: gvtorch surface`, onclick: () => app.saveSurface({ value, format, level: app.surfaceLevel }) }, text);
+    const button = (text, format) => textButton(text, "The whole surface at this value as a file, not cut: gvtorch surface", () => app.saveSurface({ value, format, level: app.surfaceLevel }));
     return el("div.gv-row", {}, el("span.gv-name", {}, "save surface, level"), el("span.gv-both", {}, level, button("PLY", "ply"), button("glTF", "glb")));
   }
 
@@ -167,10 +166,10 @@ export class Panel {
       el("div.gv-row", {}, el("span.gv-name", {}, `plane ${index + 1}`),
         this.controls.number({ type: "number", range: [-0.9, 0.9] }, plane[3], (d, rest) => clip.setPlane(index, [...plane.slice(0, 3), d], rest))),
       el("div.gv-row", {}, el("span.gv-name"), el("span.gv-both", {},
-        el("button.gv-small", { type: "button", title: "Keep the other side", onclick: () => clip.setPlane(index, plane.map((n) => -n), true) }, "turn"),
-        el("button.gv-small", { type: "button", onclick: () => clip.setClip({ ...current, planes: current.planes.filter((_, n) => n !== index) }, true) }, "remove"))),
+        textButton("turn", "Keep the other side", () => clip.setPlane(index, plane.map((n) => -n), true)),
+        textButton("remove", "", () => clip.setClip({ ...current, planes: current.planes.filter((_, n) => n !== index) }, true)))),
     ]);
-    const facing = el("button.gv-small", { type: "button", title: "A plane through the target that faces you", onclick: () => clip.addPlane() }, "add one facing me");
+    const facing = textButton("add one facing me", "A plane through the target that faces you", () => clip.addPlane());
     const capRows = current ? this.controls.fields(current, (value, rest) => clip.setClip(value, rest), { only: ["caps", "cap_opacity", "cap_light"] }) : [];
     return [crop, ...planes, el("div.gv-row", {}, el("span.gv-name", {}, "planes"), facing), ...capRows];
   }
@@ -179,7 +178,7 @@ export class Panel {
     const { app } = this;
     return Object.entries(app.parameters ?? {}).map(([name, parameter]) =>
       this.controls.row(name, parameter, parameter.value, (value, rest) => {
-        if (rest) app.setValue("set", app.parameters, name, value, (newValue) => ({ name, value: newValue }));
+        if (rest) app.setValue("set", parameter.value, value, (newValue) => ({ name, value: newValue }));
       }));
   }
 
@@ -202,7 +201,7 @@ export class Panel {
     return Object.entries(app.engine).map(([name, value]) => {
       const field = name.endsWith("pool") ? { type: "text", text: fields[name].text } : fields[name];
       return this.controls.row(name, field, value, (newValue, rest) => {
-        if (rest) app.setValue("resize", app.engine, name, newValue, (sentValue) => ({ engine: { [name]: sentValue } }));
+        if (rest) app.setValue("resize", value, newValue, (sentValue) => ({ engine: { [name]: sentValue } }));
       });
     });
   }

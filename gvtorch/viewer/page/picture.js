@@ -18,6 +18,7 @@ export class PictureView {
     this.element = el("div.gv-stage", { tabIndex: 0 }, this.canvas, this.overlayCanvas);
     this.camera = null;
     this.handles = [];
+    this.axisLetters = [];
     this.drawing = Promise.resolve();
     this.latencies = [];
     new ResizeObserver(() => this.resized()).observe(this.element);
@@ -44,31 +45,34 @@ export class PictureView {
     this.app.link.send("hello", { width, height });
   }
 
-  /** Draws a picture, then acknowledges it. */
+  /** Shows pictures one after another; one that can't be shown is reported. */
   receive({ head, bytes }) {
-    this.drawing = this.drawing.then(async () => {
-      try {
-        const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
-        const { canvas } = this;
-        if (canvas.width !== this.overlayCanvas.width || canvas.height !== this.overlayCanvas.height) {
-          [canvas.width, canvas.height] = [this.overlayCanvas.width, this.overlayCanvas.height];
-        }
-        const context = canvas.getContext("2d", { alpha: false });
-        context.imageSmoothingQuality = "high";
-        context.drawImage(image, 0, 0, canvas.width, canvas.height);
-        image.close();
-      } finally {
-        this.app.link.send("ack", { number: head.number });
+    this.drawing = this.drawing.then(() => this.show(head, bytes)).catch((error) => this.app.notify(String(error), true));
+  }
+
+  /** Draws a picture, then acknowledges it. */
+  async show(head, bytes) {
+    try {
+      const image = await createImageBitmap(new Blob([bytes], { type: "image/jpeg" }));
+      const { canvas } = this;
+      if (canvas.width !== this.overlayCanvas.width || canvas.height !== this.overlayCanvas.height) {
+        [canvas.width, canvas.height] = [this.overlayCanvas.width, this.overlayCanvas.height];
       }
-      if (head.sent) {
-        this.latencies.push(performance.now() - head.sent);
-        if (this.latencies.length > 500) this.latencies.shift();
-      }
-      this.camera = head.camera;
-      this.head = head;
-      this.drawOverlay();
-      this.element.dispatchEvent(new CustomEvent("drawn", { detail: head }));
-    });
+      const context = canvas.getContext("2d", { alpha: false });
+      context.imageSmoothingQuality = "high";
+      context.drawImage(image, 0, 0, canvas.width, canvas.height);
+      image.close();
+    } finally {
+      this.app.link.send("ack", { number: head.number });
+    }
+    if (head.sent) {
+      this.latencies.push(performance.now() - head.sent);
+      if (this.latencies.length > 500) this.latencies.shift();
+    }
+    this.camera = head.camera;
+    this.head = head;
+    this.drawOverlay();
+    this.element.dispatchEvent(new CustomEvent("drawn", { detail: head }));
   }
 
   /** The part of the canvas that the picture covers, [left, top, width, height] in pixels: all of it without planes. */
@@ -93,6 +97,7 @@ export class PictureView {
     const context = this.overlayCanvas.getContext("2d");
     context.clearRect(0, 0, this.overlayCanvas.width, this.overlayCanvas.height);
     this.handles = [];
+    this.axisLetters = [];
     if (!camera || !app.box) return;
     context.lineCap = "round";
     app.slices.draw(context);
@@ -157,7 +162,6 @@ export class PictureView {
     const { right, up, forward } = axes(camera), size = 30 * this.ratio;
     const [left, top, , height] = this.pictureRect;
     const middle = [left + 52 * this.ratio, top + height - 56 * this.ratio];
-    this.axisLetters = [];
     const order = [0, 1, 2].map((axis) => ({ axis, x: right[axis], y: -up[axis], z: forward[axis] })).sort((a, b) => b.z - a.z);
     for (const { axis, x, y, z } of order) {
       const end = [middle[0] + x * size, middle[1] + y * size];
@@ -181,7 +185,7 @@ export class PictureView {
   /** The axis whose letter is at a position in CSS pixels, or undefined. */
   axisAt(x, y) {
     const isNear = ({ at }) => Math.hypot(at[0] - x * this.ratio, at[1] - y * this.ratio) < HIT_RADIUS * this.ratio;
-    return this.app.overlays.axes ? this.axisLetters?.find(isNear) : undefined;
+    return this.axisLetters.find(isNear);
   }
 
   scaleBar(context, camera) {

@@ -20,9 +20,11 @@ export class Pointer {
     on("wheel", (event) => this.wheel(event));
     on("dblclick", (event) => this.focus(event));
     on("contextmenu", (event) => event.preventDefault());
-    on("keydown", (event) => this.key(event));
-    on("keyup", (event) => this.keys.delete(event.key.toLowerCase()));
     on("blur", () => this.keys.clear());
+    window.addEventListener("blur", () => this.keys.clear());
+    const keyboard = app.root.classList.contains("gv-page") ? document : app.root;
+    keyboard.addEventListener("keydown", (event) => this.key(event));
+    keyboard.addEventListener("keyup", (event) => this.keys.delete(event.key.toLowerCase()));
   }
 
   /** CSS pixels from the stage's corner. */
@@ -129,18 +131,19 @@ export class Pointer {
     this.app.link.send("pick", { x: clamp((x - left) / width, 0, 1), y: clamp((y - top) / height, 0, 1), purpose: "focus" });
   }
 
+  /** Handles a key, unless a control has a use for it. */
   key(event) {
-    const key = event.key.toLowerCase(), { app } = this;
+    const key = event.key.toLowerCase(), { app } = this, { target } = event;
+    if (["number", "text"].includes(target.type)) return;
     if (event.ctrlKey || event.metaKey) {
-      if (key === "z" && event.shiftKey) app.redo();
-      else if (key === "z") app.undo();
+      if (key === "z") app.travel(event.shiftKey ? "redo" : "undo");
       return;
     }
-    if (event.altKey || !app.camera) return;
+    if (event.altKey || !app.camera || app.panel.element.contains(target)) return;
     if (key in KEYS) {
       event.preventDefault();
-      if (!this.keys.size) requestAnimationFrame((now) => this.fly(now, now));
       this.keys.add(key);
+      this.flight ||= requestAnimationFrame((now) => this.fly(now, now));
     } else if ("123456".includes(key)) app.faceAxis(Math.floor((key - 1) / 2), key % 2 ? 1 : -1);
     else if (key === "f" || key === "home") app.link.send("do", { what: "fit" });
     else if (key === "o") app.switchOrtho();
@@ -155,6 +158,7 @@ export class Pointer {
   /** Flies while keys are held. */
   fly(now, lastTime) {
     const { app } = this;
+    this.flight = 0;
     if (!this.keys.size) return app.finishMove();
     const { right, up, forward } = axes(app.camera);
     let direction = [0, 0, 0];
@@ -165,6 +169,6 @@ export class Pointer {
     const seconds = Math.min(0.1, (now - lastTime) / 1000);
     const pace = Math.max(halfHeight(app.camera), 0.02 * distance(app.camera));
     app.moveCamera(shifted(app.camera, times(direction, seconds * pace * 1.2 * this.speed)), true);
-    requestAnimationFrame((next) => this.fly(next, now));
+    this.flight = requestAnimationFrame((next) => this.fly(next, now));
   }
 }

@@ -1,10 +1,9 @@
 // Transfer functions by name: those that come with gvtorch, the user's own, stored by the browser, and those of
 // files of gvtorch, ParaView and 3D Slicer, which the server reads.
-import { el, iconButton, saveFile, openText } from "./dom.js";
+import { el, iconButton, textButton, saveFile, openText } from "./dom.js";
 import { domain } from "./transfer.js";
 
 const STORAGE_KEY = "gvtorch transfer functions";
-const MAX_CHARACTERS = 900000;  // characters of a file that may be sent
 const SUFFIXES = ".json,.vp,.xml";
 
 /** The user's own functions by name; none if the browser stores nothing. */
@@ -55,8 +54,8 @@ export class Presets {
         iconButton("open", "Load a transfer function: of gvtorch or ParaView (JSON), or 3D Slicer (.vp, .vp.json, presets.xml)", () => openText(SUFFIXES, (name, text) => this.open(name, text), (reason) => this.app.notify(reason, true))),
       ],
       saveBar: el("div.gv-bar", {}, this.target, this.name,
-        el("button.gv-small", { type: "button", title: "Save these colours", onclick: () => this.save() }, "save"),
-        ownNames.includes(this.chosen) ? el("button.gv-small", { type: "button", title: `Forget ${this.chosen}`, onclick: () => this.forget() }, "forget") : null),
+        textButton("save", "Save these colours", () => this.save()),
+        ownNames.includes(this.chosen) ? textButton("forget", `Forget ${this.chosen}`, () => this.forget()) : null),
     };
   }
 
@@ -77,7 +76,6 @@ export class Presets {
   }
 
   read(file, text, name) {
-    if (text.length > MAX_CHARACTERS) return this.app.notify(`${file}: ${text.length} letters, more than ${MAX_CHARACTERS}`, true);
     this.app.link.send("read", { file, text, name, ...this.span() });
   }
 

@@ -45,7 +45,7 @@ export class TransferEditor {
     const on = (name, handler) => this.canvas.addEventListener(name, handler);
     on("pointerdown", (event) => this.down(event));
     on("pointermove", (event) => this.moved(event));
-    on("pointerup", () => this.up());
+    for (const name of ["pointerup", "pointercancel"]) on(name, () => this.up());
     on("dblclick", (event) => this.recolor(event));
     on("contextmenu", (event) => this.remove(event));
     on("keydown", (event) => { if (["Delete", "Backspace"].includes(event.key)) this.removeChosen(); });
@@ -64,8 +64,7 @@ export class TransferEditor {
 
   setHistogram(histogram) {
     this.histogram = histogram;
-    this.span = this.f ? this.wholeSpan() : null;
-    this.draw();
+    if (this.f) this.set(this.f);
   }
 
   /** The range of values that the editor shows. */
