@@ -42,6 +42,11 @@ class DicomSource(VolumeSource):
     # File, number in it, slope and intercept of each frame, by time, then slice.
     frames: tuple[tuple[str, int, float, float], ...]
 
+    @property
+    def files(self) -> set[str]:
+        """The files of all frames."""
+        return {file for file, *_ in self.frames}
+
     def check_file(self) -> None:
         """Raises ValueError if an uncompressed file is too short for its images, or if their values
         do not begin at the lowest bit.

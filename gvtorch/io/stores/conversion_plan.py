@@ -173,7 +173,7 @@ def plan_of(
     fields = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
-        "fingerprint": _fingerprint(user_source, source),
+        "fingerprint": _fingerprint(user_source, source, target),
         **{name: getattr(source, name) for name in fields},
         "unit": source.info.unit,
         "times": layout.times,
@@ -300,7 +300,7 @@ def check_room(target: Path, estimate: Estimate) -> None:
         )
 
 
-def _fingerprint(user_source: Any, source: VolumeSource) -> list[Any]:
+def _fingerprint(user_source: Any, source: VolumeSource, target: Path) -> list[Any]:
     """Returns values that are equal while a source, and what is read of it, are unchanged."""
     fingerprint = source.fingerprint()
     if fingerprint is not None:
@@ -309,12 +309,14 @@ def _fingerprint(user_source: Any, source: VolumeSource) -> list[Any]:
         return unfinished.fingerprint(user_source)
     is_file = isinstance(user_source, (str, Path))
     fields: list[Any] = [list(source.shape), source.stored]
-    fields = unfinished.fingerprint(source.path) if is_file else fields
+    fields = unfinished.fingerprint(source.path, target) if is_file else fields
     while isinstance(source, (IndexSource, StraightSource)):
         source = source.inner
     if isinstance(source, MemorySource):
         return [*fields, unfinished.checksum([source.data])]
-    if (file := getattr(source, "file", source.path)) != source.path:  # beside its header
-        fields += unfinished.fingerprint(file)
+    if not Path(source.path).is_dir():  # files beside the one that was named
+        files = {getattr(source, "file", source.path), *getattr(source, "files", ())}
+        for file in sorted(files - {source.path}):
+            fields += unfinished.fingerprint(file)
     # What is read of it: the chosen array, its axes, byte order, ...
     return [*fields, zlib.crc32(repr(source).replace(source.path, "").encode())]
