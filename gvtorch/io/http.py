@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import http.client
+import io
 import os
 import re
 import socket
@@ -172,7 +173,7 @@ def _read(
             raise OSError(f"another part came: {content_range[0]}")
         body_range = byte_range if response.status == 200 else None
         content = _read_content(
-            response, deadline, max_bytes, body_range, max_file_bytes, connection
+            url, response, deadline, max_bytes, body_range, max_file_bytes, connection
         )
         is_complete = response.isclosed()
         return content
@@ -185,6 +186,7 @@ def _read(
 
 
 def _read_content(
+    url: str,
     response: http.client.HTTPResponse,
     deadline: float,
     max_bytes: int,
@@ -196,14 +198,14 @@ def _read_content(
     file; bytes before that range are not kept in memory.
     """
     # `content` starts at byte `content_start` of the response's body.
-    content, content_start = bytearray(), 0
+    content, content_start, stream = bytearray(), 0, unpacked(url, response)
     start, stop = (body_range.start or 0, body_range.stop) if body_range is not None else (0, None)
     limit = max_bytes if body_range is None else max_file_bytes
     while stop is None or content_start + len(content) < stop:
         if time.monotonic() > deadline:
             raise TimeoutError
         try:
-            chunk = response.read1(_PART_BYTES)
+            chunk = stream.read1(_PART_BYTES)
         except TimeoutError:
             raise
         except Exception as error:  # http.client has its own exceptions
@@ -229,6 +231,31 @@ def _read_content(
     if len(wanted) > max_bytes:
         raise Endless(f"the server sends more than {max_bytes} bytes")
     return bytes(wanted)
+
+
+def unpacked(url: str, response: http.client.HTTPResponse) -> Any:
+    """Returns a stream of a file as it was before its server packed it (gzip or deflate), which was
+    not asked for. Parts of files are left as they are, and so are .gz files that were not packed
+    again.
+    """
+    is_packed = response.headers.get("Content-Encoding") in ("gzip", "x-gzip", "deflate")
+    if not is_packed or response.status == 206:
+        return response
+    from .packed import GZIP_MAGIC, ZlibStream
+
+    start = response.peek(1)
+    if urllib.parse.urlsplit(url).path.endswith("gz"):
+        start = ZlibStream(io.BytesIO(start)).read(2) if start.startswith(GZIP_MAGIC) else b""
+    if not start.startswith((GZIP_MAGIC, b"x")):
+        return response
+    return io.BufferedReader(ZlibStream(response))
+
+
+def is_forbidden(error: OSError) -> bool:
+    """Returns whether a server refused a file: buckets that can't be listed say so of files that
+    are not there.
+    """
+    return re.search(r"\b403 |PERMISSION_DENIED", str(error)) is not None
 
 
 def _send_request(

@@ -23,7 +23,7 @@ from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
 from ..cf_source import CfSource, cf_fields
-from ..source import Index, Triple
+from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import is_number
@@ -106,18 +106,26 @@ def _is_zarr_group(path: str) -> bool:
     try:
         if (description := _describe_array(path)) is not None:
             return description[0] != "n5"
-        attributes = _read_attributes(path)
+        return not _is_image(path) and bool(_array_names(path))
     except (ValueError, OSError):
         return False  # the OME-Zarr format reports what is wrong
+
+
+def _is_image(folder: str) -> bool:
+    """Returns whether a folder is an OME-NGFF image, or a group of them."""
     image_keys = {"multiscales", "ome", "gvtorch", "bioformats2raw.layout", "plate", "well"}
-    return not image_keys & set(attributes) and bool(_array_names(path))
+    return bool(image_keys & set(_read_attributes(folder)))
 
 
 @Format("Zarr", matches=_is_zarr_group, options=("key", "axes"))
-def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) -> ChunkedSource:
-    """Opens an array, or the array `key` of a group, the only one if left out. `axes` as in
-    `ask_axes`.
+def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) -> VolumeSource:
+    """Opens an array, or the array or OME-NGFF image `key` of a group, the only array if left out.
+    `axes` as in `ask_axes`.
     """
+    if key is not None and axes is None and _is_image(str(Path(path) / key.strip("/"))):
+        from .ome_zarr import open_ome_zarr  # imported here, as its format comes after this one
+
+        return open_ome_zarr(path, key.strip("/"))
     folder = _choose_array(path, key)
     driver, metadata = _describe_array(folder) or ("", {})
     source, shape = _open_source(path, driver, folder)

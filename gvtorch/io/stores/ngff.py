@@ -16,10 +16,10 @@ from typing import Any
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import length_unit, metres, time_unit
-from ..http import Endless
+from ..http import Endless, file_url, is_forbidden, refused
 from ..remote import is_file_url
 from .store_layout import JOURNAL, MANIFEST, RESUME_ADVICE, WORK, StoreLayout, is_number
-from .tensorstores import MAX_JSON_BYTES, Deadline, child, read_key
+from .tensorstores import MAX_JSON_BYTES, Deadline, StoreError, child, read_key
 
 CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
 _MAX_LEVELS = 64
@@ -73,27 +73,16 @@ def find_image(
     attributes = _attributes(location, root, deadline)
     if attributes is None:
         raise _no_store_error(location, root, deadline)
-    store_json = attributes.get("gvtorch")
-    layout = None if store_json is None else StoreLayout.parse(location, store_json)
-    pyramid = _parse_image(location, attributes, image)
-    series = _ngff_attribute(attributes, "bioformats2raw.layout")
-    if pyramid is None and layout is None:
-        # "0" is the folder that bioformats2raw uses.
-        folders = attributes.get(CHANNELS_ATTRIBUTE, ["0"])
-        has_names = isinstance(folders, list) and folders and isinstance(folders[0], str)
-        folder = image if image is not None else folders[0] if has_names else "0"
-        if ".." not in folder and not folder.startswith("/"):
-            parent, root = root, child(root, folder)
-            folder_attributes = _attributes(f"{location}/{folder}", root, deadline)
-            pyramid = _parse_image(location, folder_attributes, None) if folder_attributes else None
-            store_json = folder_attributes.get("gvtorch") if folder_attributes else None
-            layout = (
-                None
-                if store_json is None
-                else StoreLayout.parse(f"{location}/{folder}", store_json)
-            )
-            if pyramid is not None and image is None and series is not None:
-                _note_other_images(pyramid, _other_images(location, parent, deadline, folder))
+    group = attributes
+    pyramid, layout = _parse_group(location, group, image)
+    if pyramid is None:
+        folders = _image_folders(location, root, group, deadline) if image is None else [image]
+        if ".." not in folders[0] and not folders[0].startswith("/"):
+            root, inner = child(root, folders[0]), f"{location}/{folders[0]}"
+            group = _attributes(inner, root, deadline) or {}
+            pyramid, layout = _parse_group(inner, group, None)
+            if pyramid is not None:
+                _note_other_images(pyramid, folders[1:])
     if pyramid is None:
         problem = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
@@ -101,22 +90,28 @@ def find_image(
         names = _image_names(attributes) if image is not None else []
         names_hint = f"; it holds {_join_some(names)}" if names else ""
         raise ValueError(f"{location}: has {problem} (NGFF multiscales){names_hint}{plate_hint}")
-    if layout is not None and isinstance(store_json, dict):
-        pyramid.info, pyramid.store_json = (
-            _stored_info(store_json.get("info"), pyramid.info),
-            store_json,
-        )
-    else:
-        pyramid.dropped += _label_notes(location, root, deadline)
+    if layout is not None:
+        pyramid.store_json = group["gvtorch"]
+        pyramid.info = _stored_info(pyramid.store_json.get("info"), pyramid.info)
+    pyramid.dropped += _label_notes(location, root, deadline)
     return root, pyramid, layout
 
 
 def read_json(
     location: str, root: Any, name: str, deadline: Deadline, max_bytes: int = MAX_JSON_BYTES
 ) -> dict[str, Any] | None:
-    """Reads a JSON object from a file in a folder, as `parse_json`; None if there is no file."""
-    content = read_key(location, root, name, deadline, max_bytes=max_bytes)
-    return None if content is None else parse_json(f"{location}/{name}", content, max_bytes)
+    """Reads a JSON object from a file in a folder, as `parse_json`; None if there is no file, which
+    servers also tell by 403, or by sending a page in its place.
+    """
+    try:
+        content = read_key(location, root, name, deadline, max_bytes=max_bytes)
+    except StoreError as error:
+        if isinstance(root, str) and is_forbidden(error):
+            return None
+        raise
+    if content is None or (isinstance(root, str) and content.lstrip()[:1] == b"<"):
+        return None
+    return parse_json(f"{location}/{name}", content, max_bytes)
 
 
 def parse_json(location: str, content: bytes, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
@@ -146,10 +141,12 @@ def read_json_file(file: Path) -> dict[str, Any]:
 
 
 def _attributes(location: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
-    """Returns a group's attributes, from zarr.json (v3) or .zattrs (v2)."""
+    """Returns a group's attributes, from zarr.json (v3) or .zattrs (v2), which a group may lack."""
     group = read_json(location, root, "zarr.json", deadline)
     if group is None:
-        return read_json(location, root, ".zattrs", deadline)
+        attributes = read_json(location, root, ".zattrs", deadline)
+        is_group = attributes is None and read_json(location, root, ".zgroup", deadline) is not None
+        return {} if is_group else attributes
     attributes = group.get("attributes", {})
     if group.get("node_type") != "group" or not isinstance(attributes, dict):
         raise ValueError(f"{location}: zarr.json is that of no group; expected an OME-Zarr image")
@@ -162,12 +159,25 @@ def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     work_folder = child(root, WORK)
     manifest = read_json(location, work_folder, MANIFEST, deadline)
     if manifest is None:
-        return ValueError(f"{location}: not a store: has neither zarr.json nor .zattrs")
+        reason = refused(file_url(root, "zarr.json")) if isinstance(root, str) else ""
+        return ValueError(
+            f"{location}: not a store: has neither zarr.json nor .zattrs"
+            + (f" ({reason})" if reason else "")
+        )
     done = (read_key(location, work_folder, JOURNAL, deadline) or b"").count(b"\n")
     return ValueError(
         f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
         f"{RESUME_ADVICE}"
     )
+
+
+def _parse_group(
+    location: str, attributes: dict[str, Any], image: str | None
+) -> tuple[MultiscaleImage | None, StoreLayout | None]:
+    """Returns the image that `_parse_image` finds, and the layout of the group, if it has one."""
+    store_json = attributes.get("gvtorch")
+    layout = None if store_json is None else StoreLayout.parse(location, store_json)
+    return _parse_image(location, attributes, image), layout
 
 
 def _parse_image(
@@ -222,17 +232,23 @@ def _note_other_images(image: MultiscaleImage, others: list[str]) -> None:
         image.dropped.append(f"the images {_join_some(others)} {hint}")
 
 
-def _other_images(location: str, root: Any, deadline: Deadline, opened: str) -> list[str]:
-    """Returns the names of the other images of a bioformats2raw layout."""
+def _image_folders(
+    location: str, root: Any, attributes: dict[str, Any], deadline: Deadline
+) -> list[str]:
+    """Returns the folders of the images in a group: the channels of a store of several, or the
+    series that OME lists, else "0", and "1" if there is such an image (bioformats2raw's layout).
+    """
+    folders = attributes.get(CHANNELS_ATTRIBUTE)
     try:
-        attributes = _attributes(f"{location}/OME", child(root, "OME"), deadline) or {}
-        series = _ngff_attribute(attributes, "series")
-        if isinstance(series, list):
-            return [str(path) for path in series if path != opened]
-        has_second = _attributes(f"{location}/1", child(root, "1"), deadline) is not None
+        if folders is None:
+            ome = _attributes(f"{location}/OME", child(root, "OME"), deadline)
+            folders = _ngff_attribute(ome or {}, "series")
+        if not isinstance(folders, list):
+            has_second = _attributes(f"{location}/1", child(root, "1"), deadline) is not None
+            folders = ["0", "1"] if has_second else ["0"]
     except (OSError, ValueError):  # damage there must not prevent opening the image
-        return []
-    return ["1"] if has_second else []
+        return ["0"]
+    return [folder for folder in folders if isinstance(folder, str)] or ["0"]
 
 
 def _label_notes(location: str, root: Any, deadline: Deadline) -> list[str]:
@@ -288,7 +304,7 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
     name = item.get("name")
     channels, damaged = _read_channels(omero) if omero is not None else ((), [])
     (step, origin), step_unit = times[0], units.get("t")
-    has_time_step = "t" in axes and (step_unit is not None or step != 1)
+    has_time_step = "t" in axes and step > 0 and (step_unit is not None or step != 1)
     info = ImageInfo(
         unit=units.get("x"),
         channels=channels,
