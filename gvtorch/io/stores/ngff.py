@@ -33,8 +33,8 @@ class ImageArray:
     """One array of a multiscale image."""
 
     path: str
-    scale: tuple[float, float, float]  # z y x
-    translation: tuple[float, float, float]  # z y x
+    scale: tuple[float, ...]  # z y x
+    translation: tuple[float, ...]  # z y x
 
 
 @dataclass
@@ -205,14 +205,10 @@ def _parse_image(
 
 def _image_names(attributes: dict[str, Any]) -> list[str]:
     """Returns the names under which `find_image` finds the images that a group lists."""
-    images, folders = _ngff_attribute(attributes, "multiscales"), attributes.get(CHANNELS_ATTRIBUTE)
-    multiscales, folder_names = (
-        listed if isinstance(listed, list) else [] for listed in (images, folders)
-    )
-    names = [
-        str(item.get("name", n)) for n, item in enumerate(multiscales) if isinstance(item, dict)
-    ]
-    return [*names, *(name for name in folder_names if isinstance(name, str))]
+    listed = _ngff_attribute(attributes, "multiscales"), attributes.get(CHANNELS_ATTRIBUTE)
+    images, folders = (items if isinstance(items, list) else [] for items in listed)
+    names = [str(item.get("name", n)) for n, item in enumerate(images) if isinstance(item, dict)]
+    return [*names, *(name for name in folders if isinstance(name, str))]
 
 
 def _join_some(names: list[str]) -> str:
@@ -282,11 +278,11 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
     if not isinstance(datasets, list) or not 1 <= len(datasets) <= _MAX_LEVELS:
         raise ValueError(f"{location}: multiscales must have 1 to {_MAX_LEVELS} datasets")
     outer = _parse_transforms(location, item.get("coordinateTransformations"), axes, dropped)
-    scales, times = [], []
+    factors, scales, times = _unit_factors(units, dropped), [], []
     for dataset in datasets:
-        path = dataset.get("path") if isinstance(dataset, dict) else None
-        is_printable = isinstance(path, str) and path.isprintable() and ".." not in path
-        if not isinstance(path, str) or not is_printable or not path or path.startswith("/"):
+        path: Any = dataset.get("path") if isinstance(dataset, dict) else None
+        is_inside = isinstance(path, str) and path and path.isprintable() and path[0] != "/"
+        if not is_inside or ".." in path:
             raise ValueError(
                 f"{location}: a dataset needs a path inside the store, got {brief(path)}"
             )
@@ -295,11 +291,11 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
         )
         time_scale, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
         time_offset, *offsets = (m * s + o for m, s, o in zip(translation, *outer, strict=True))
-        factors = _unit_factors(units, dropped)
         spacing, position = (
-            [a * f for a, f in zip(lengths, factors, strict=True)] for lengths in (zyx, offsets)
+            tuple(a * f for a, f in zip(lengths, factors, strict=True))
+            for lengths in (zyx, offsets)
         )
-        scales.append(ImageArray(path.strip("/"), _triple(spacing), _triple(position)))
+        scales.append(ImageArray(path.strip("/"), spacing, position))
         times.append((time_scale, time_offset))
     name = item.get("name")
     channels, damaged = _read_channels(omero) if omero is not None else ((), [])
@@ -318,24 +314,17 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
     )
 
 
-def _triple(values: Sequence[float]) -> tuple[float, float, float]:
-    z, y, x = values
-    return (z, y, x)
-
-
 def _unit_factors(units: dict[str, str], dropped: list[str]) -> list[float]:
     """Returns factors along z, y, x that convert lengths to the unit of x."""
     x_unit, factors = units.get("x"), []
     for axis in "zyx":
         unit = units.get(axis)
-        metres_per_unit, metres_per_x = metres(unit), metres(x_unit)
-        factors.append(
-            float(f"{metres_per_unit / metres_per_x:.12g}")
-            if metres_per_unit and metres_per_x
-            else 1.0
-        )
-        if not (metres_per_unit and metres_per_x) and unit is not None and unit != x_unit:
+        metres_per_unit, metres_per_x, factor = metres(unit), metres(x_unit), 1.0
+        if metres_per_unit and metres_per_x:
+            factor = float(f"{metres_per_unit / metres_per_x:.12g}")
+        elif unit is not None and unit != x_unit:
             dropped.append(f"unit {brief(unit)} of {axis}, where that of x is {x_unit!r}")
+        factors.append(factor)
     return factors
 
 
@@ -411,24 +400,17 @@ def image_metadata(
         pairs = list(zip(layout.axes, factors, strict=True))
         scale = [steps[axis] * factor for axis, factor in pairs]
         translation = [origins[axis] + (factor - 1) / 2 * steps[axis] for axis, factor in pairs]
-        transforms = [
-            {"type": "scale", "scale": scale},
-            {"type": "translation", "translation": translation},
-        ]
-        datasets.append({"path": str(level), "coordinateTransformations": transforms})
+        transforms = {"scale": scale, "translation": translation}
+        listed = [{"type": kind, kind: numbers} for kind, numbers in transforms.items()]
+        datasets.append({"path": str(level), "coordinateTransformations": listed})
     method = "mode" if info.labels else "mean"  # how coarse levels are made
     ome: dict[str, Any] = {
         "version": "0.5",
         "multiscales": [{"name": name, "type": method, "axes": axes, "datasets": datasets}],
     }
-    extras: dict[str, Any] = {
-        "quantity": info.quantity,
-        "space": info.space,
-        "labels": info.labels or None,
-    }
+    extras: dict[str, Any] = {"quantity": info.quantity, "space": info.space, "labels": info.labels}
     if info.channels:
-        ome["omero"], assumed = _write_channels(info.channels, layout.value_range or ())
-        extras["assumed"] = assumed or None
+        ome["omero"], extras["assumed"] = _write_channels(info.channels, layout.value_range or ())
     return ome, {key: value for key, value in extras.items() if value}
 
 
@@ -484,15 +466,12 @@ def _write_channels(
 def _forget_assumed(channels: Sequence[ChannelInfo], assumed: Any) -> tuple[ChannelInfo, ...]:
     """Returns the channels without the colours and windows that `_write_channels` made up."""
     fields = assumed if isinstance(assumed, dict) else {}
-    assumed_numbers = {
-        name: fields[name] for name in ("color", "window") if isinstance(fields.get(name), list)
-    }
-    cleaned = []
-    for number, channel in enumerate(channels):
-        cleared: dict[str, Any] = {
-            name: None for name, numbers in assumed_numbers.items() if number in numbers
-        }
-        cleaned.append(replace(channel, **cleared))
+    cleaned = list(channels)
+    for name in ("color", "window"):
+        for number in fields[name] if isinstance(fields.get(name), list) else ():
+            if number in range(len(cleaned)):
+                cleared: dict[str, Any] = {name: None}
+                cleaned[number] = replace(cleaned[number], **cleared)
     return tuple(cleaned)
 
 
@@ -505,10 +484,7 @@ def _parse_color(text: Any) -> Rgb | None:
 def _parse_window(window: Any) -> tuple[float, float] | None:
     if not isinstance(window, dict):
         return None
-    bounds: list[Any] = [
-        window.get("start", window.get("min")),
-        window.get("end", window.get("max")),
-    ]
-    if not all(map(is_number, bounds)) or bounds[0] > bounds[1]:
-        return None
-    return (float(bounds[0]), float(bounds[1]))
+    low: Any = window.get("start", window.get("min"))
+    high: Any = window.get("end", window.get("max"))
+    is_valid = is_number(low) and is_number(high) and low <= high
+    return (float(low), float(high)) if is_valid else None
