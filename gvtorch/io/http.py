@@ -96,14 +96,9 @@ def read_http(
         raise Endless(reason)
     max_seconds = STALL_SECONDS + max_bytes / MIN_BYTES_PER_SECOND
     deadline = time.monotonic() + min(seconds, max_seconds)
+    max_file_bytes = max_bytes if max_file_bytes is None else max_file_bytes
     try:
-        return _read(
-            url,
-            max_bytes,
-            byte_range,
-            max_bytes if max_file_bytes is None else max_file_bytes,
-            deadline,
-        )
+        return _read(url, max_bytes, byte_range, max_file_bytes, deadline)
     except TimeoutError:
         if seconds < max_seconds and time.monotonic() >= deadline:
             raise
@@ -143,8 +138,9 @@ def _read(
     url: str, max_bytes: int, byte_range: slice | None, max_file_bytes: int, deadline: float
 ) -> bytes | None:
     headers = dict(REQUEST_HEADERS)
+    first = 0 if byte_range is None else byte_range.start or 0
     if byte_range is not None:
-        first, last = byte_range.start or 0, "" if byte_range.stop is None else byte_range.stop - 1
+        last = "" if byte_range.stop is None else byte_range.stop - 1
         headers["Range"] = f"bytes={first}" if first < 0 else f"bytes={first}-{last}"
     patience = max(1e-3, min(deadline - time.monotonic(), STALL_SECONDS))
     try:
@@ -164,12 +160,7 @@ def _read(
         if response.status not in (200, 206):
             raise HttpStatus(response.status, response.reason)
         content_range = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
-        if (
-            content_range
-            and byte_range
-            and (byte_range.start or 0) >= 0
-            and int(content_range[1]) != (byte_range.start or 0)
-        ):
+        if content_range and byte_range and int(content_range[1]) != first >= 0:
             raise OSError(f"another part came: {content_range[0]}")
         body_range = byte_range if response.status == 200 else None
         content = _read_content(
@@ -276,14 +267,14 @@ def _send_request(
             connection.request("GET", request_target, headers=headers)
             _connections.note_activity(connection)
             response = connection.getresponse()
-            if response.status not in _REDIRECT_STATUS:
-                return connection, response
-            response.close()
         except BaseException as error:
             _connections.give_back(url, connection, keep=False)
             if is_reused and isinstance(error, _CLOSED_ERRORS):
                 continue  # the server has closed the idle connection
             raise
+        if response.status not in _REDIRECT_STATUS:
+            return connection, response
+        response.close()
         _connections.give_back(url, connection, keep=False)
         return None, ask_by_urllib(url, headers, seconds)
 
@@ -329,12 +320,10 @@ class _Connections:
                 if connection.sock is not None:
                     connection.sock.settimeout(seconds)
                     return connection, True
-        if key[1] == "https":
-            connection = http.client.HTTPSConnection(
-                key[2], timeout=seconds, context=_certificates()
-            )
-            return connection, False
-        return http.client.HTTPConnection(key[2], timeout=seconds), False
+        if key[1] == "http":
+            return http.client.HTTPConnection(key[2], timeout=seconds), False
+        certificates = _certificates()
+        return http.client.HTTPSConnection(key[2], timeout=seconds, context=certificates), False
 
     def note_activity(self, connection: http.client.HTTPConnection) -> None:
         """Records that a connection waits from now on for an answer, or for more of one."""

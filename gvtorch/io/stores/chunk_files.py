@@ -29,20 +29,22 @@ _MISSING_OFFSET = 2**63  # offsets from here on mark missing chunks
 _BLOSC_HEADER_BYTES = 8  # that are read of its header; the last four are the unpacked size
 
 
-def check_file(path: str, max_bytes: int) -> int | None:
+def check_file(path: str, max_bytes: int, name: str = "") -> int | None:
     """Returns the size of a file in bytes; None if there is none. Follows links.
 
     Raises:
-        Endless: It is a folder, a pipe, a device, or longer than `max_bytes`.
+        Endless: It is a folder, a pipe, a device, or longer than `max_bytes`; the message begins
+            with `name`, if given.
     """
     try:
         status = os.stat(path)
     except (OSError, ValueError):
         return None  # if this is an error, tensorstore reports it
+    prefix = f"{name}: " if name else ""
     if not stat.S_ISREG(status.st_mode):
-        raise Endless("is not a regular file")
+        raise Endless(f"{prefix}is not a regular file")
     if status.st_size > max_bytes:
-        raise Endless(f"takes {status.st_size} bytes, more than the {max_bytes} that fit")
+        raise Endless(f"{prefix}takes {status.st_size} bytes, more than the {max_bytes} that fit")
     return status.st_size
 
 

@@ -8,7 +8,6 @@ import shutil
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,16 +15,14 @@ from typing import Any
 import numpy as np
 
 from ...base import check
-from ...base.labels import background
 from ...base.volume import Volume
-from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
 from ..label_source import IndexSource
 from ..oblique import Oblique, StraightSource
 from ..reading import FormatSettings, open_source, read_time_points, with_placement
-from ..source import MemorySource, VolumeSource, no_time_message
+from ..source import MemorySource, VolumeSource, check_time
 from . import shard, unfinished
-from .level_reader import Pool
+from .level_reader import pool_of
 from .store_layout import BLOCKS, DTYPES, StoreLayout
 from .tensorstores import context, kvstore
 
@@ -100,8 +97,7 @@ def source_of(
     if isinstance(source, VolumeSource):
         return source
     if isinstance(source, Volume):
-        if time not in (None, 0):
-            raise ValueError(no_time_message(source.name, time, 1))
+        check_time(source.name, 0 if time is None else time, 1)
         if labels and not source.info.labels:
             raise ValueError("convert: the volume must hold labels: gv.Volume(data, labels=True)")
         if source.filter == "directional":
@@ -185,10 +181,7 @@ def plan_of(
         "labels": source.info.labels,
         "tasks": sum(tasks),
     }
-    pool: Pool = pool_mean
-    if source.info.labels:
-        pool = partial(pool_majority, background=background(label_values))
-    root = kvstore(target)
+    root, pool = kvstore(target), pool_of(source.info, label_values)
     return Plan(
         target=target,
         task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),

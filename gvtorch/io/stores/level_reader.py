@@ -12,14 +12,17 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ...base import boxes, check
 from ...base.boxes import Zyx
-from ...base.labels import check_narrowed
-from ..source import no_time_message
+from ...base.image_info import ImageInfo
+from ...base.labels import background, check_narrowed
+from ...pool.downsample import pool_majority, pool_mean
+from ..source import check_time
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
 from .store_layout import MAX_STORE_VOXELS, StoreLayout, value_dtype
@@ -28,6 +31,13 @@ from .tensorstores import Deadline, StoreError, begin_open, child, one_line_erro
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE_SIDE = 64  # voxels along a side of a tile that is computed on demand
 _CACHE_BYTES = 128 << 20  # bytes of cached tiles
+
+
+def pool_of(info: ImageInfo, label_values: np.ndarray | None) -> Pool:
+    """Returns what makes coarser voxels of an image: the mean, or the most frequent label."""
+    if not info.labels:
+        return pool_mean
+    return partial(pool_majority, background=background(label_values))
 
 
 @dataclass(frozen=True)
@@ -131,8 +141,7 @@ def _channel_index(
 ) -> slice | list[int]:
     size = {axis: int(n) for axis, n in zip(axes, array.shape, strict=True)}
     times, width = size.get("t", 1), size.get("c", 1)
-    if isinstance(time, bool) or not isinstance(time, int) or not 0 <= time < times:
-        raise ValueError(no_time_message(context, time, times))
+    check_time(context, time, times)
     if channels is None:
         return slice(None)
     selected = list(check.instance(context, "channels", channels, tuple, list, range))
