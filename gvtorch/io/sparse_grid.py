@@ -88,9 +88,9 @@ class SparseGrid(ABC):
             section_voxels = padded_voxels // int((stop - start)[axis])
             step = max(leaf, _MAX_PADDED_VOXELS // section_voxels // leaf * leaf)
             for edge in range(int(start[axis]), int(b[axis]), step):  # in pieces along that axis
-                first, last = a.copy(), b.copy()
-                first[axis], last[axis] = max(edge, a[axis]), min(edge + step, b[axis])
-                out[boxes.index(first - a, last - a)] = self.fill(first, last)
+                part_low, part_high = a.copy(), b.copy()
+                part_low[axis], part_high[axis] = max(edge, a[axis]), min(edge + step, b[axis])
+                out[boxes.index(part_low - a, part_high - a)] = self.fill(part_low, part_high)
             return out
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background

@@ -62,11 +62,8 @@ def _describe_array(folder: str) -> tuple[str, dict[str, Any]] | None:
         file = Path(folder) / name
         if file.is_file():
             metadata = read_json_file(file)
-            is_array = {
-                "zarr3": metadata.get("node_type") == "array",
-                "n5": "dimensions" in metadata,
-            }
-            return (driver, metadata) if is_array.get(driver, True) else None
+            is_array = driver == "zarr" or metadata.get("node_type") == "array"
+            return (driver, metadata) if is_array or "dimensions" in metadata else None
     return None
 
 
@@ -141,16 +138,12 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
             sibling = Path(folder).parent / name
             if sibling.parent != Path(folder).parent or name == "..":
                 continue  # the name of an axis must not be a path to another folder
-            if (
-                name
-                and sibling != Path(folder)
-                and (description := _describe_array(str(sibling))) is not None
-            ):
+            is_other = name and sibling != Path(folder)
+            if is_other and (description := _describe_array(str(sibling))) is not None:
                 coordinates, files = _open_array(description[0], str(sibling), source.opened)
                 if coordinates.shape == (shape[axis],) and shape[axis] < 1 << 24:
-                    values = Deadline(_READ_TIMEOUT).wait(
-                        begin_read(coordinates, files), str(sibling)
-                    )
+                    future = begin_read(coordinates, files)
+                    values = Deadline(_READ_TIMEOUT).wait(future, str(sibling))
                     steps[axis] = even_steps(name, values, dropped)
                     units[axis] = str(_read_attributes(str(sibling)).get("units", "")) or None
     axis_order = axis_order or ask_axes(path, shape, axes)
@@ -240,14 +233,9 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
         sizes, origin = (list(transform.get(n) or [])[::-1] for n in ("scale", "translate"))
         unit = transform.get("units")
     unit = unit[0] if isinstance(unit, list) and unit else unit
-    steps = dict(zip(axis_order, _numbers_or_default(sizes, rank, 1.0), strict=True))
-    starts = dict(zip(axis_order, _numbers_or_default(origin, rank, 0.0), strict=True))
-    factors = dict(
-        zip(
-            axis_order,
-            _numbers_or_default(metadata.get("downsamplingFactors"), rank, 1.0),
-            strict=True,
-        )
+    given = ((sizes, 1.0), (origin, 0.0), (metadata.get("downsamplingFactors"), 1.0))
+    steps, starts, factors = (
+        dict(zip(axis_order, _numbers_or_default(*values, rank), strict=True)) for values in given
     )
     voxel_size = [abs(steps.get(a, 1.0) * factors.get(a, 1.0)) for a in "xyz"]
     spacing, unit_name = spacing_of(voxel_size, [unit if isinstance(unit, str) else None] * 3)
@@ -258,6 +246,6 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
     return spacing, (x, y, z), unit_name
 
 
-def _numbers_or_default(values: Any, count: int, default: float) -> list[float]:
+def _numbers_or_default(values: Any, default: float, count: int) -> list[float]:
     is_valid = isinstance(values, list) and len(values) == count and all(map(is_number, values))
     return [float(v) for v in values] if is_valid else [default] * count
