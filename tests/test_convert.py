@@ -155,6 +155,11 @@ def test_values_that_are_not_finite(tmp_path):
     with pytest.raises(ValueError, match=r"5 values are NaN or infinite \(of 54000\); pass nan="):
         convert(tmp_path / "a.npy", tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr").exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "a.zarr").symlink_to(tmp_path / "mine")
+    with pytest.raises(ValueError, match="5 values are NaN"):
+        convert(tmp_path / "a.npy", tmp_path / "a.zarr")
+    assert not list((tmp_path / "mine").iterdir())
     store = convert(tmp_path / "a.npy", tmp_path / "a.zarr", nan=7)
     assert_holds(store, np.where(np.isfinite(data), data, np.float32(7))[..., None])
 
@@ -270,6 +275,38 @@ def test_resume_refuses_a_source_that_has_changed(tmp_path, raw, monkeypatch):
     os.utime(raw, ns=(1, 1))
     with pytest.raises(ValueError, match="the source is not the one that it was begun with"):
         convert(raw, tmp_path / "a.zarr", resume=True)
+
+
+def test_resume_refuses_an_image_whose_chunks_have_changed(tmp_path, data, monkeypatch):
+    image = write_foreign(tmp_path / "image", [data[..., 0]], "zyx", [[1.0] * 3])
+    with monkeypatch.context() as patch:
+        crash_after(patch, 1, Crash())
+        with pytest.raises(Crash):
+            convert(image, tmp_path / "a.zarr", workers=1)
+    chunk = image / "s0" / "c" / "0" / "0" / "0"
+    os.utime(chunk, ns=(1, 1))
+    with pytest.raises(ValueError, match="the source is not the one that it was begun with"):
+        convert(image, tmp_path / "a.zarr", resume=True)
+
+
+def test_a_store_within_the_folder_of_its_source_goes_on(tmp_path, data, monkeypatch):
+    imagecodecs = pytest.importorskip("imagecodecs")
+    for number, plane in enumerate(data[..., 0]):
+        (tmp_path / f"{number}.png").write_bytes(imagecodecs.png_encode(plane))
+    with monkeypatch.context() as patch:
+        crash_after(patch, 1, Crash())
+        with pytest.raises(Crash):
+            convert(tmp_path, tmp_path / "a.zarr", workers=1)
+    assert_holds(convert(tmp_path, tmp_path / "a.zarr", resume=True), data)
+
+
+def test_work_that_a_kill_left_beside_a_finished_store_is_removed(tmp_path, raw, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("gvtorch.io.stores.unfinished.shutil.rmtree", lambda *_, **__: None)
+        convert(raw, tmp_path / "a.zarr")
+    assert (tmp_path / "a.zarr" / WORK / "manifest.json").exists()
+    convert(raw, tmp_path / "a.zarr", resume=True)
+    assert not (tmp_path / "a.zarr" / WORK).exists()
 
 
 @pytest.mark.parametrize("kind", ["h5", "npz", "raw", "mhd", "npy"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from pathlib import Path
@@ -13,7 +14,9 @@ from helpers import gvtorch
 from helpers.stores import assert_holds, noise
 
 import gvtorch as gv
+from gvtorch.io.reading import as_source
 from gvtorch.io.stores import conversion, shard, unfinished
+from gvtorch.io.stores.channels import convert_channels
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.store import Store
 from gvtorch.io.stores.store_layout import WORK
@@ -78,6 +81,25 @@ def test_a_converter_does_not_take_over_what_another_has_begun(tmp_path, raw, da
         with pytest.raises(FileExistsError, match="half-written; continue with --resume"):
             convert(raw, target)
     assert_holds(convert(raw, target, resume=True), data)
+
+
+def test_channels_of_another_converter_are_not_taken_for_ones_own(tmp_path, monkeypatch):
+    target, original = tmp_path / "a.zarr", unfinished.as_json
+    mine, other = (
+        {"a": as_source("test", np.full((9, 9, 9), number, np.uint8), "zyx")} for number in (1, 2)
+    )
+
+    def meanwhile(value):
+        with monkeypatch.context() as patch:
+            patch.setattr(unfinished, "as_json", original)
+            with contextlib.suppress(OSError):
+                convert_channels(other, target)
+        return original(value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(unfinished, "as_json", meanwhile)
+        store = convert_channels(mine, target)
+    assert (store.read_region(0, (0, 0, 0), (9, 9, 9)) == 1).all()
 
 
 def test_the_lock_of_a_target_that_went_away_is_taken_anew(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import torch
 from helpers import gvtorch
 
 import gvtorch as gv
+from gvtorch.io.stores import coarse
 from gvtorch.io.stores.store_layout import WORK
 
 MISTY = gv.TransferFunction([(30, 0), (250, 0.08)], [(30, 1, 0.3, 0.1), (250, 1, 1, 1)])
@@ -150,6 +151,24 @@ def test_one_at_a_time_and_nothing_is_forgotten(store):
 
 
 @pytest.mark.backend("cpp")
+def test_channels_of_two_times_are_made_at_once(tmp_path, monkeypatch):
+    np.save(tmp_path / "a.npy", np.stack([matter().data.numpy()[..., 0]] * 2))
+    gv.convert(tmp_path / "a.npy", tmp_path / "a.zarr", axes="tzyx")
+    first, second = (gv.Store.open(tmp_path / "a.zarr", time=time) for time in (0, 1))
+    original = coarse._map_level_file
+
+    def map_file(*arguments):
+        with monkeypatch.context() as patch:
+            patch.setattr(coarse, "_map_level_file", original)
+            if not second.coarse:
+                gv.Filtered.add_to(second, MISTY)
+        return original(*arguments)
+
+    monkeypatch.setattr(coarse, "_map_level_file", map_file)
+    gv.Filtered.add_to(first, MISTY)
+    assert [*first.coarse] == [*second.coarse] == ["filtered"]
+
+
 def test_channels_that_were_picked_are_refused(tmp_path):
     gv.convert(matter(width=2), tmp_path / "a.zarr")
     picked = gv.Store.open(tmp_path / "a.zarr", channels=[1])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import locale
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.damage import assert_robust
-from helpers.stores import noise
+from helpers.stores import noise, stopped_at
 
 import gvtorch as gv
 from gvtorch.io.reading import open_source
@@ -171,12 +172,18 @@ def test_images_of_one_place_are_times(tmp_path, data):
     assert np.array_equal(source.read_times(0, 1)[0][..., 0], data[:, ::-1, ::-1])
 
 
-def test_a_series_converts(tmp_path, data):
+def test_a_series_converts(tmp_path, data, monkeypatch):
     folder = write_series(tmp_path / "ct", data)
     store = convert(folder, tmp_path / "a.zarr")
     volume = gv.read_volume(folder)
     assert store.spacing == pytest.approx(SPACING) and store.info.unit == "millimeter"
     assert np.array_equal(store.read_region(0, (0, 0, 0), SHAPE), volume.data.numpy())
+    first, *_, last = sorted(folder.iterdir())
+    with stopped_at(monkeypatch, 1), pytest.raises(KeyboardInterrupt):
+        convert(first, tmp_path / "b.zarr", workers=1)
+    os.utime(last, ns=(1, 1))
+    with pytest.raises(ValueError, match="the source is not the one that it was begun with"):
+        convert(first, tmp_path / "b.zarr", resume=True)
 
 
 # --- files of pydicom

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import http.server
 import threading
 import time
@@ -28,6 +29,7 @@ class Server(WebServer):
     tag: str | None = '"one"'
     modified: str | None = None
     sized = True
+    packed = False
     cut = 0
     sent: list[str]
 
@@ -62,6 +64,8 @@ class Handler(BaseHTTPRequestHandler):
                 self.send_header(header, value)
         if server.sized:
             self.send_header("Content-Length", str(len(content)))
+        if server.packed:
+            self.send_header("Content-Encoding", "gzip")
         self.end_headers()
         self.wfile.write(content[: len(content) - server.cut])
 
@@ -151,6 +155,15 @@ def test_a_broken_download_leaves_nothing(tmp_path, server, grid):
     assert not kept(tmp_path)
     with pytest.raises(FileNotFoundError, match="volume not found: http"):
         gv.read_volume(f"{server.url}/none.npy")
+
+
+@pytest.mark.parametrize("name", ["a.npy", "a.npy.gz", "b.npy.gz"])
+def test_what_a_server_packs_is_unpacked(server, grid, name):
+    """Also .gz files that are packed again, but not those of which it only says so."""
+    server.packed, content = True, gzip.compress(server.files["/x/a.npy"])
+    server.files[f"/{name}"] = gzip.compress(content) if name == "b.npy.gz" else content
+    volume = gv.read_volume(f"{server.url}/{name}")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid) and volume.name == name
 
 
 def test_without_a_network_the_copy_is_used(server, grid, monkeypatch):

@@ -74,7 +74,7 @@ def test_what_ngff_holds_comes_back(tmp_path, info, times, spacing, origin, dtyp
         expected = ImageInfo(**{**vars(expected), "time_origin": 0.0})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gvtorch.io.stores.conversion_plan.open_source", lambda *_, **__: source)
-        patch.setattr("gvtorch.io.stores.unfinished.fingerprint", lambda _: [])
+        patch.setattr("gvtorch.io.stores.unfinished.fingerprint", lambda *_: [])
         store = convert("a", tmp_path / "a.zarr", workers=1)
     yaozarrs.validate_zarr_store(str(tmp_path / "a.zarr"))
     for reopened in (store, convert(tmp_path / "a.zarr", tmp_path / "b.zarr", workers=1)):
@@ -266,14 +266,18 @@ def test_what_lies_beside_an_image_is_named(tmp_path):
     assert "not kept: the images 1, 2 beside '0'" in line and volume.data[0, 0, 0] == data[0, 0, 0]
     volume, warned = read_with_warnings(several, key="2")
     assert not warned and volume.data[0, 0, 0, 0] == data[0, 0, 0] + 2
+    (several / "OME/.zattrs").write_text('{"series": ["2", "0"]}')
+    volume, (line,) = read_with_warnings(several)
+    assert "the images 0 beside '2'" in line and volume.data[0, 0, 0] == data[0, 0, 0] + 2
     assert convert(several, tmp_path / "one.zarr", key="1").info == ImageInfo()
     assert Store.open(tmp_path / "one.zarr").read_region(0, (0,) * 3, (1,) * 3) == data[0, 0, 0] + 1
-    labels = write_foreign(tmp_path / "cells.zarr", [data], "zyx", [[1.0] * 3])
-    write_foreign(labels / "labels/nuclei", [data], "zyx", [[1.0] * 3])
+    write_foreign(tmp_path / "cells.zarr", [data], "zyx", [[1.0] * 3])
     group = {"zarr_format": 3, "node_type": "group", "attributes": {"ome": {"labels": ["nuclei"]}}}
-    (labels / "labels/zarr.json").write_text(json.dumps(group))
-    assert "the labels labels/nuclei" in read_with_warnings(labels)[1][0]
-    assert read_with_warnings(labels, key="labels/nuclei")[1] == []
+    for labels in (tmp_path / "cells.zarr", tmp_path / "one.zarr"):
+        write_foreign(labels / "labels/nuclei", [data], "zyx", [[1.0] * 3])
+        (labels / "labels/zarr.json").write_text(json.dumps(group))
+        assert "the labels labels/nuclei" in read_with_warnings(labels)[1][0]
+        assert read_with_warnings(labels, key="labels/nuclei")[1] == []
     with serving(tmp_path) as url:
         for base in (tmp_path, url):
             assert read_with_warnings(f"{base}/cells.zarr:/labels/nuclei")[1] == []
@@ -286,6 +290,17 @@ def test_what_lies_beside_an_image_is_named(tmp_path):
     with pytest.raises(ValueError, match="it is a plate: name a field of view, as in 'A/1/0'"):
         gv.read_volume(tmp_path / "plate")
     assert read_with_warnings(tmp_path / "plate", key="A/1/0")[0].extent == (8, 7, 6)
+    (tmp_path / "plate/.zattrs").unlink()  # a group like any other
+    image, _ = read_with_warnings(f"{tmp_path}/plate:/A/1/0")
+    assert np.array_equal(image.data[..., 0].numpy(), data)
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0])
+def test_time_steps_that_are_none_are_left_out(tmp_path, step):
+    data = np.zeros((2, 3, 4, 5), np.uint8)
+    assert Store.open(write_foreign(tmp_path, [data], "tzyx", [[step, 1, 1, 1]])).info == (
+        ImageInfo()
+    )
 
 
 def test_axes_and_units_of_other_kinds(tmp_path):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gzip
 import itertools
 import json
 import math
 import shutil
 import threading
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -340,6 +342,23 @@ def test_scales_that_dropped_a_last_voxel(tmp_path):
     )
 
 
+@pytest.mark.parametrize("differs", ["times", "channels", "dtype", "place"])
+def test_levels_that_differ_in_more_than_size_are_made_instead(tmp_path, differs):
+    data = np.full((3, 2, 16, 16, 16), 7, np.uint8)
+    half = data[:, :, ::2, ::2, ::2] + 90
+    half = {"times": half[:2], "channels": half[:, :1], "dtype": half + 0.5}.get(differs, half)
+    write_foreign(tmp_path, [data, half], "tczyx", [[1.0] * 5, [1.0, 1.0, 2.0, 2.0, 2.0]])
+    if differs == "place":
+        file = tmp_path / "zarr.json"
+        content = json.loads(file.read_text())
+        level = content["attributes"]["ome"]["multiscales"][0]["datasets"][1]
+        move = {"type": "translation", "translation": [0, 0, 0, 0, 40]}
+        level["coordinateTransformations"].append(move)
+        file.write_text(json.dumps(content))
+    values = Store.open(tmp_path, time=2, channels=[1]).read_region(1, (0, 0, 0), (8, 8, 8))
+    assert (values == 7).all()
+
+
 def test_two_dimensional_images_are_one_slice(tmp_path):
     data = noise((1, 40, 70, 1))
     write_foreign(tmp_path, [data[0, ..., 0]], "yx", [[1.0, 1.0]])
@@ -430,6 +449,48 @@ def test_reads_end_in_time(served):
     ):
         with pytest.raises(TimeoutError, match=r"no answer within 0\.2 s"):
             read()
+
+
+class OddHandler(Handler):
+    """Serves as `how` says: files that are not there, or what is sent of others."""
+
+    how = ""
+
+    def do_GET(self) -> None:
+        file = Path(self.translate_path(self.path))
+        if file.is_file() and self.how not in ("gzip", "deflate"):
+            super().do_GET()
+            return
+        content = b" <!doctype html><title>app</title>"
+        if file.is_file():
+            pack = gzip.compress if self.how == "gzip" else zlib.compress
+            content = pack(file.read_bytes())
+        is_missing = not file.is_file() and self.how != "page"
+        self.send_response((403 if self.how == "forbidden" else 404) if is_missing else 200)
+        if file.is_file():
+            self.send_header("Content-Encoding", self.how)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+
+@pytest.mark.parametrize("how", ["forbidden", "page", "gzip", "deflate"])
+def test_servers_that_answer_in_ways_of_their_own(tmp_path, how, monkeypatch):
+    """Buckets that can't be listed; apps that send a page for any path; files packed on the way."""
+    monkeypatch.setattr(OddHandler, "how", how)
+    empty = np.zeros((40, 300, 40), np.uint8)
+    empty[:, 280:] = noise((40, 20, 40))
+    convert(gv.Volume(empty), tmp_path / "own", threshold=1)  # not all shards of blocks are there
+    write_foreign(tmp_path / "foreign", [empty + 1], "zyx", [[1.0] * 3], version=2)
+    with serving(tmp_path, OddHandler) as url:
+        for name, expected in (("own", empty), ("foreign", empty + 1)):
+            store = Store.open(f"{url}/{name}")
+            assert np.array_equal(store.read_region(0, (0, 0, 0), empty.shape)[..., 0], expected)
+            positions = np.array(list(np.ndindex(*store.block_grid(0))))
+            _, errors = store.read_blocks(0, positions)
+            assert not errors or how == "page", errors
+        with pytest.raises(ValueError, match=r"not a store: has neither zarr\.json nor"):
+            Store.open(f"{url}/none")
 
 
 def test_stores_in_memory_open_too():

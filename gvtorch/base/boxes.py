@@ -21,6 +21,11 @@ def index(low: Any, high: Any) -> tuple[slice, ...]:
     return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
 
 
+def box_of(index: tuple[slice, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Returns the low and the high end of the box that an index selects."""
+    return tuple(span.start for span in index), tuple(span.stop for span in index)
+
+
 def clamped_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
     """Returns the part of a box inside a grid, else the nearest voxels; one a side at least."""
     start = [min(max(a, 0), n - 1) for a, n in zip(low, shape, strict=True)]

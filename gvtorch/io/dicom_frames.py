@@ -231,11 +231,8 @@ def _time_fields(ordered: list[list[DicomFrame]], attribute: str | None) -> dict
     if len(ordered) == 1:
         return {}
     first_attributes, last_attributes = (ordered[index][0].attributes for index in (0, -1))
-    name = (
-        attribute
-        if attribute in _TIME_UNITS
-        else next((n for n in _TIME_UNITS if n in first_attributes), None)
-    )
+    known = (n for n in _TIME_UNITS if n in first_attributes)
+    name = attribute if attribute in _TIME_UNITS else next(known, None)
     if name is None:
         return {}
     step = (last_attributes.get(name, 0.0) - first_attributes.get(name, 0.0)) / (len(ordered) - 1)
@@ -285,17 +282,14 @@ def image_info(
         dropped.append("the modality's table: values are those that it looks up")
     if header.get("RealWorldValueMappingSequence") and header.get("RescaleSlope") is None:
         dropped.append("the mapping to real world values: values are as stored")
-    quantity = str(
-        header.get("RescaleType") or header.get("Units") or header.get("DoseUnits") or ""
-    )
+    quantities = (header.get(name) for name in ("RescaleType", "Units", "DoseUnits"))
+    quantity = str(next(filter(None, quantities), ""))
     if header.get("Modality") == "CT" and quantity in ("", "US") and not uses_table:
         quantity = "HU"
     shared = _first_item(header.get("SharedFunctionalGroupsSequence"))
     voi = _first_item(shared.get("FrameVOILUTSequence")) if shared is not None else None
-    center, width = (
-        _floats((voi if voi is not None else header).get(name))
-        for name in ("WindowCenter", "WindowWidth")
-    )
+    window = voi if voi is not None else header
+    center, width = (_floats(window.get(name)) for name in ("WindowCenter", "WindowWidth"))
     channels: tuple[ChannelInfo, ...] = ()
     if samples == 3:
         channels = color_channels()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import http.client
+import io
 import os
 import re
 import socket
@@ -95,14 +96,9 @@ def read_http(
         raise Endless(reason)
     max_seconds = STALL_SECONDS + max_bytes / MIN_BYTES_PER_SECOND
     deadline = time.monotonic() + min(seconds, max_seconds)
+    max_file_bytes = max_bytes if max_file_bytes is None else max_file_bytes
     try:
-        return _read(
-            url,
-            max_bytes,
-            byte_range,
-            max_bytes if max_file_bytes is None else max_file_bytes,
-            deadline,
-        )
+        return _read(url, max_bytes, byte_range, max_file_bytes, deadline)
     except TimeoutError:
         if seconds < max_seconds and time.monotonic() >= deadline:
             raise
@@ -142,8 +138,9 @@ def _read(
     url: str, max_bytes: int, byte_range: slice | None, max_file_bytes: int, deadline: float
 ) -> bytes | None:
     headers = dict(REQUEST_HEADERS)
+    first = 0 if byte_range is None else byte_range.start or 0
     if byte_range is not None:
-        first, last = byte_range.start or 0, "" if byte_range.stop is None else byte_range.stop - 1
+        last = "" if byte_range.stop is None else byte_range.stop - 1
         headers["Range"] = f"bytes={first}" if first < 0 else f"bytes={first}-{last}"
     patience = max(1e-3, min(deadline - time.monotonic(), STALL_SECONDS))
     try:
@@ -163,16 +160,11 @@ def _read(
         if response.status not in (200, 206):
             raise HttpStatus(response.status, response.reason)
         content_range = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
-        if (
-            content_range
-            and byte_range
-            and (byte_range.start or 0) >= 0
-            and int(content_range[1]) != (byte_range.start or 0)
-        ):
+        if content_range and byte_range and int(content_range[1]) != first >= 0:
             raise OSError(f"another part came: {content_range[0]}")
         body_range = byte_range if response.status == 200 else None
         content = _read_content(
-            response, deadline, max_bytes, body_range, max_file_bytes, connection
+            url, response, deadline, max_bytes, body_range, max_file_bytes, connection
         )
         is_complete = response.isclosed()
         return content
@@ -185,6 +177,7 @@ def _read(
 
 
 def _read_content(
+    url: str,
     response: http.client.HTTPResponse,
     deadline: float,
     max_bytes: int,
@@ -196,14 +189,14 @@ def _read_content(
     file; bytes before that range are not kept in memory.
     """
     # `content` starts at byte `content_start` of the response's body.
-    content, content_start = bytearray(), 0
+    content, content_start, stream = bytearray(), 0, unpacked(url, response)
     start, stop = (body_range.start or 0, body_range.stop) if body_range is not None else (0, None)
     limit = max_bytes if body_range is None else max_file_bytes
     while stop is None or content_start + len(content) < stop:
         if time.monotonic() > deadline:
             raise TimeoutError
         try:
-            chunk = response.read1(_PART_BYTES)
+            chunk = stream.read1(_PART_BYTES)
         except TimeoutError:
             raise
         except Exception as error:  # http.client has its own exceptions
@@ -231,6 +224,31 @@ def _read_content(
     return bytes(wanted)
 
 
+def unpacked(url: str, response: http.client.HTTPResponse) -> Any:
+    """Returns a stream of a file as it was before its server packed it (gzip or deflate), which was
+    not asked for. Parts of files are left as they are, and so are .gz files that were not packed
+    again.
+    """
+    is_packed = response.headers.get("Content-Encoding") in ("gzip", "x-gzip", "deflate")
+    if not is_packed or response.status == 206:
+        return response
+    from .packed import GZIP_MAGIC, ZlibStream
+
+    start = response.peek(1)
+    if urllib.parse.urlsplit(url).path.endswith("gz"):
+        start = ZlibStream(io.BytesIO(start)).read(2) if start.startswith(GZIP_MAGIC) else b""
+    if not start.startswith((GZIP_MAGIC, b"x")):
+        return response
+    return io.BufferedReader(ZlibStream(response))
+
+
+def is_forbidden(error: OSError) -> bool:
+    """Returns whether a server refused a file: buckets that can't be listed say so of files that
+    are not there.
+    """
+    return re.search(r"\b403 |PERMISSION_DENIED", str(error)) is not None
+
+
 def _send_request(
     url: str, headers: dict[str, str], seconds: float
 ) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
@@ -249,14 +267,14 @@ def _send_request(
             connection.request("GET", request_target, headers=headers)
             _connections.note_activity(connection)
             response = connection.getresponse()
-            if response.status not in _REDIRECT_STATUS:
-                return connection, response
-            response.close()
         except BaseException as error:
             _connections.give_back(url, connection, keep=False)
             if is_reused and isinstance(error, _CLOSED_ERRORS):
                 continue  # the server has closed the idle connection
             raise
+        if response.status not in _REDIRECT_STATUS:
+            return connection, response
+        response.close()
         _connections.give_back(url, connection, keep=False)
         return None, ask_by_urllib(url, headers, seconds)
 
@@ -302,12 +320,10 @@ class _Connections:
                 if connection.sock is not None:
                     connection.sock.settimeout(seconds)
                     return connection, True
-        if key[1] == "https":
-            connection = http.client.HTTPSConnection(
-                key[2], timeout=seconds, context=_certificates()
-            )
-            return connection, False
-        return http.client.HTTPConnection(key[2], timeout=seconds), False
+        if key[1] == "http":
+            return http.client.HTTPConnection(key[2], timeout=seconds), False
+        certificates = _certificates()
+        return http.client.HTTPSConnection(key[2], timeout=seconds, context=certificates), False
 
     def note_activity(self, connection: http.client.HTTPConnection) -> None:
         """Records that a connection waits from now on for an answer, or for more of one."""

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..base import boxes
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
 from ..base.stage import Progress
 from .resources import cores, run_ahead
@@ -51,7 +52,7 @@ class IndexSource(VolumeSource):
         return replace(self, inner=self.inner.staged(folder), labels=str(folder / LABELS))
 
     def read_stored(self, index: Index) -> np.ndarray:
-        times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
+        times, (low, high) = index[0], boxes.box_of(index[1:4])
         values = self.inner.read_box(low, high, (times.start, times.stop))[..., index[4]]
         if self.indexed:
             return values

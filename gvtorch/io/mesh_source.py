@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from ..base import check
+from ..base.boxes import box_of
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..meshes.holes import SolidParts, warn_of_holes
@@ -109,7 +110,7 @@ class MeshSource(VolumeSource):
         return [*self.identity, self.channel, *settings.values()]
 
     def read_stored(self, index: Index) -> np.ndarray:
-        low, high = [span.start for span in index[:3]], [span.stop for span in index[:3]]
+        low, high = box_of(index[:3])
         with _LOCK:  # the first thread builds the hierarchy
             grid = _voxelizer(self)
         return grid.region(low, high)[self.channel].cpu().numpy()[..., index[3]]

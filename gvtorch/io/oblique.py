@@ -46,7 +46,7 @@ class StraightSource(VolumeSource):
         self.inner.check_file()
 
     def read_stored(self, index: Index) -> np.ndarray:
-        times, low, high = index[0], *zip(*((s.start, s.stop) for s in index[1:4]), strict=True)
+        times, (low, high) = index[0], boxes.box_of(index[1:4])
         size = [b - a for a, b in zip(low, high, strict=True)]
         out = np.empty((times.stop - times.start, *size, self.width), self.stored)
         out[...] = self.fill

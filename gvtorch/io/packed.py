@@ -16,6 +16,7 @@ from typing import IO, Any
 
 from ..base.messages import need_library
 
+GZIP_MAGIC = b"\x1f\x8b"
 _READ_BYTES = 1 << 20
 _MAX_BLOCK_BYTES = 1 << 26  # of a Blosc block; VDB writers use blocks of 256 KB
 _STORED_FLAG = 2  # Blosc's flag for data that is stored uncompressed
@@ -42,14 +43,16 @@ def open_unpacked(
         elif codec == "bz2":
             unpacked = bz2.BZ2File(packed)
         elif codec == "zlib":
-            unpacked = io.BufferedReader(_ZlibStream(packed))
+            unpacked = io.BufferedReader(ZlibStream(packed))
         yield unpacked
 
 
-class _ZlibStream(io.RawIOBase):
-    """What an open file unpacks to by zlib, or by gzip, from its position on."""
+class ZlibStream(io.RawIOBase):
+    """What an open file or an answer of a server unpacks to by zlib, or by gzip, from its position
+    on.
+    """
 
-    def __init__(self, packed: IO[bytes]) -> None:
+    def __init__(self, packed: io.BufferedIOBase) -> None:
         self._file, self._unpacker = packed, zlib.decompressobj(zlib.MAX_WBITS | 32)
 
     def readable(self) -> bool:
@@ -59,7 +62,7 @@ class _ZlibStream(io.RawIOBase):
         """Unpacks at most as many bytes as the buffer has; returns how many, 0 at the end."""
         part = b""
         while not part and not self._unpacker.eof:
-            packed = self._unpacker.unconsumed_tail or self._file.read(_READ_BYTES)
+            packed = self._unpacker.unconsumed_tail or self._file.read1(_READ_BYTES)
             if not packed:
                 break
             part = self._unpacker.decompress(packed, len(buffer))
@@ -96,7 +99,7 @@ def is_packed_fits(path: str) -> bool:
     """
     with open(path, "rb") as file:
         magic = file.read(6)
-    if magic != b"SIMPLE" and not magic.startswith(b"\x1f\x8b"):
+    if magic != b"SIMPLE" and not magic.startswith(GZIP_MAGIC):
         raise ValueError(f"{path}: is not a FITS file")
     return magic != b"SIMPLE"
 

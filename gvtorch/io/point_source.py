@@ -16,6 +16,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from ..base import check
+from ..base.boxes import box_of
 from ..base.image_info import PREMULTIPLIED, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..points.points import Points
@@ -63,9 +64,7 @@ class SplatSource(VolumeSource):
         return list(self.identity)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        low, high = (
-            tuple(end) for end in zip(*((s.start, s.stop) for s in index[:3]), strict=True)
-        )
+        low, high = box_of(index[:3])
         sums = region(_open_sorted(self.folder), low, high)[..., index[3]]
         with np.errstate(over="ignore"):
             return sums.astype(np.float32)

@@ -24,7 +24,7 @@ from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
 from .remote import fetch, is_file_url, local_path
 from .resources import check_memory
-from .source import ArraySource, Index, MemorySource, VolumeSource, convert_errors, no_time_message
+from .source import ArraySource, Index, MemorySource, VolumeSource, check_time, convert_errors
 from .stores.ngff import is_zarr
 from .stores.store_layout import DTYPES, MAX_STORE_VOXELS, MAX_TIMES
 from .stores.tensorstores import StoreError
@@ -145,8 +145,7 @@ def open_source(
         check_extent(text, source.extent, max_values=MAX_STORE_VOXELS)
         if not 1 <= source.times <= MAX_TIMES or min(source.shape) < 1:
             raise ValueError(f"{text}: expected 1 to {MAX_TIMES} time points, got {source.times}")
-        if time is not None and (type(time) is not int or not 0 <= time < source.times):
-            raise ValueError(no_time_message(text, time, source.times))
+        check_time(text, 0 if time is None else time, source.times)
         source = source.at_time(time or 0)
         is_label_number = source.info.labels and np.dtype(source.dtype).kind in "iuf"
         if source.dtype not in DTYPES and not is_label_number:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import hmac
 import http.server
+import operator
 import os
 import re
 import secrets
@@ -29,6 +30,7 @@ from .http import (
     Endless,
     HttpStatus,
     file_url,
+    is_forbidden,
     is_http,
     keep_reason,
     read_http,
@@ -45,6 +47,7 @@ _MAX_METADATA_BYTES = 1 << 24  # bytes of a file of metadata
 _INDEX_CACHE_BYTES = 1 << 26  # bytes of shards' indexes that are cached for a folder
 _NO_BYTES = slice(0, 0)  # what "bytes=-0" asks for
 _RETRIES = {"max_retries": 4, "initial_delay": "200ms", "max_delay": "1s"}
+_BLOCKS = "/gvtorch/blocks/"  # in the URLs of arrays of which files may be missing
 _UNSATISFIABLE = 416  # status code for a range with no byte of the file
 _MAX_CONCURRENT = 16  # concurrent requests for one folder
 
@@ -92,6 +95,8 @@ class Relayed:
             if files is not None and content is not None:
                 self._check_content(name, byte_range, content, files)
         except OSError as error:
+            if is_forbidden(error) and _BLOCKS in url:
+                return None  # the store finds out whether it should be there
             keep_reason(url, error)
             raise
         return content
@@ -105,11 +110,7 @@ class Relayed:
                 2 * files.chunk_bytes + EXTRA_BYTES + _MAX_JOINED_BYTES, files.index_bytes
             )
         if byte_range is not None:
-            start, stop = byte_range.start, byte_range.stop
-            if stop is not None:
-                max_bytes = stop - start
-            else:
-                max_bytes = -start if start < 0 else min(max_part_bytes, max_file_bytes)
+            max_bytes = range_bytes(byte_range, min(max_part_bytes, max_file_bytes))
             if not 0 < max_bytes <= min(max_part_bytes, max_file_bytes):
                 raise Endless(f"{max_bytes} bytes are asked for, more than a chunk has")
         url = file_url(self.url, name)
@@ -127,10 +128,7 @@ class Relayed:
         if files.index and byte_range == index_range:
             with self._lock:
                 self._indexes[name] = files.entries(content)
-                while (
-                    len(self._indexes) * files.index_bytes > _INDEX_CACHE_BYTES
-                    and len(self._indexes) > 1
-                ):
+                while len(self._indexes) > max(1, _INDEX_CACHE_BYTES // files.index_bytes):
                     self._indexes.popitem(last=False)
             return
         if files.index and byte_range is None:
@@ -145,13 +143,8 @@ class Relayed:
     def _read_bucket(self, name: str, byte_range: slice | None, max_bytes: int) -> bytes | None:
         seconds = STALL_SECONDS + max_bytes / MIN_BYTES_PER_SECOND
         try:
-            return read_within(
-                self._bucket,
-                name,
-                byte_range,
-                max_bytes,
-                lambda future: future.result(timeout=seconds),
-            )
+            wait = operator.methodcaller("result", timeout=seconds)
+            return read_within(self._bucket, name, byte_range, max_bytes, wait)
         except TimeoutError:
             raise Endless("the server sends hardly anything") from None
         except OSError:
@@ -167,6 +160,12 @@ class Relayed:
         import tensorstore as ts
 
         return ts.KvStore.open(self.url, context=self._context).result(timeout=STALL_SECONDS)
+
+
+def range_bytes(byte_range: slice, default: int) -> int:
+    """Returns how many bytes a range has; `default` if it has no end."""
+    start, stop = byte_range.start or 0, byte_range.stop
+    return stop - start if stop is not None else -start if start < 0 else default
 
 
 def read_within(
@@ -284,13 +283,11 @@ def _parse_range(text: str) -> slice | None:
 
 @functools.cache
 def _server() -> _Server:
+    has_proxy = any(key.lower().endswith("_proxy") for key in os.environ)
     for name in ("no_proxy", "NO_PROXY"):  # libcurl would ask a proxy even for this machine
         no_proxy = os.environ.get(name, "")
-        if (
-            any(key.lower().endswith("_proxy") for key in os.environ)
-            and "127.0.0.1" not in no_proxy
-        ):
-            os.environ[name] = f"{no_proxy},127.0.0.1" if no_proxy else "127.0.0.1"
+        if has_proxy and "127.0.0.1" not in no_proxy:
+            os.environ[name] = f"{no_proxy},127.0.0.1".lstrip(",")
     return _Server()
 
 

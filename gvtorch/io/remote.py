@@ -25,7 +25,7 @@ from urllib.parse import unquote, urlsplit
 from ..base.digits import whole_number
 from ..base.messages import need_library, one_line
 from ..base.whole_file import cache_folder, write_text
-from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib
+from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib, unpacked
 from .resources import amount
 
 _TIMEOUT = 30.0  # seconds without a byte
@@ -154,7 +154,8 @@ def _open_http(url: str, known_version: Version) -> Download | None:
         for name in ("ETag", "Last-Modified")
         if response.headers.get(name)
     }
-    return response, whole_number(length), version
+    stream = unpacked(url, response)
+    return stream, whole_number(length) if stream is response else None, version
 
 
 def _open_fsspec(url: str, known_version: Version) -> Download | None:

@@ -360,12 +360,13 @@ def number_type(name: str) -> str | None:
     )
 
 
-def no_time_message(context: str, time: object, times: int) -> str:
-    """Returns the message about a time point that does not exist."""
-    available = (
-        "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
-    )
-    return f"{context}: has no time {time!r}; it has {available}"
+def check_time(context: str, time: object, times: int) -> None:
+    """Raises ValueError if there is no such time point."""
+    if type(time) is not int or not 0 <= time < times:
+        available = (
+            "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
+        )
+        raise ValueError(f"{context}: has no time {time!r}; it has {available}")
 
 
 @contextmanager

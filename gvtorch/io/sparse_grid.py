@@ -14,12 +14,13 @@ import functools
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ..base import boxes
 from ..base.image_info import ChannelInfo, ImageInfo
 from ..base.volume import check_extent
 from .source import Index, VolumeSource, place_axes
@@ -77,13 +78,20 @@ class SparseGrid(ABC):
     def leaf(self, offset: int) -> np.ndarray:
         """Returns (512, c) the voxels of the leaf at an offset in `data`."""
 
-    def fill(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
+    def fill(self, low: ArrayLike, high: ArrayLike) -> np.ndarray:
         """Returns (i, j, k, c) values of a box."""
         leaf, a, b = SIDES[2], np.asarray(low), np.asarray(high)
         start, stop = a // leaf * leaf, -(-b // leaf) * leaf  # whole leaves
         padded_voxels, axis = math.prod((stop - start).tolist()), int((b - a).argmax())
         if padded_voxels > max(_MAX_PADDED_VOXELS, 2 * math.prod((b - a).tolist())):
-            return self._pieces(a, b, axis, padded_voxels // int((stop - start)[axis]))
+            out = np.empty((*(b - a), len(self.background)), self.dtype)
+            section_voxels = padded_voxels // int((stop - start)[axis])
+            step = max(leaf, _MAX_PADDED_VOXELS // section_voxels // leaf * leaf)
+            for edge in range(int(start[axis]), int(b[axis]), step):  # in pieces along that axis
+                part_low, part_high = a.copy(), b.copy()
+                part_low[axis], part_high[axis] = max(edge, a[axis]), min(edge + step, b[axis])
+                out[boxes.index(part_low - a, part_high - a)] = self.fill(part_low, part_high)
+            return out
         out = np.empty((*(stop - start), len(self.background)), self.dtype)
         out[:] = self.background
         tiles = self._overlapping(self.root_origins, SIDES[0], start, stop)
@@ -101,26 +109,7 @@ class SparseGrid(ABC):
             for row, offset in enumerate(self.node_offsets[2][numbers].tolist()):
                 leaves[row] = self.leaf(offset)
             blocks[i, :, j, :, k] = leaves.reshape(-1, 8, 8, 8, out.shape[3])
-        return out[tuple(slice(x - s, y - s) for x, y, s in zip(a, b, start, strict=True))]
-
-    def _pieces(
-        self, low: np.ndarray, high: np.ndarray, axis: int, section_voxels: int
-    ) -> np.ndarray:
-        """Fills a box in pieces along an axis; a cross-section of leaves has `section_voxels`."""
-        side = SIDES[2]
-        step = max(side, _MAX_PADDED_VOXELS // section_voxels // side * side)
-        out = np.empty((*(high - low), len(self.background)), self.dtype)
-        piece_ends = [
-            *range(int(low[axis]) // side * side + step, int(high[axis]), step),
-            int(high[axis]),
-        ]
-        a, b = low.copy(), high.copy()
-        for end in piece_ends:
-            b[axis], part = end, [slice(None)] * 3
-            part[axis] = slice(a[axis] - low[axis], end - low[axis])
-            out[tuple(part)] = self.fill(a.tolist(), b.tolist())
-            a[axis] = end
-        return out
+        return out[boxes.index(a - start, b - start)]
 
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns (3,) the lowest voxel and (3,) one past the highest voxel of all leaves and all
@@ -149,7 +138,7 @@ class SparseGrid(ABC):
         side, origin = SIDES[level + 1], self.origins[level][number]
         a = np.maximum((start - origin) // side, 0)
         b = np.minimum(-((origin - stop) // side), COUNTS[level])
-        index = tuple(slice(x, y) for x, y in zip(a, b, strict=True))
+        index = boxes.index(a, b)
         is_visible = is_tile[index] & self._is_foreground(values[index])
         return origin + (a + np.argwhere(is_visible)) * side, values[index][is_visible]
 
@@ -179,7 +168,7 @@ class SparseGrid(ABC):
         for origin, value in zip(origins - start, values, strict=True):
             a, b = np.maximum(origin, 0), np.minimum(origin + side, size)
             if (a < b).all():
-                out[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = value
+                out[boxes.index(a, b)] = value
 
 
 def _blocks(out: np.ndarray) -> np.ndarray:

@@ -137,41 +137,27 @@ class SurfaceFile:
     def _gltf_header(self, vertex_bytes: int, face_bytes: int) -> dict[str, object]:
         """Returns the JSON of a .glb, given the sizes of both parts in bytes."""
         bounds = {"min": self._bounds[0].tolist(), "max": self._bounds[1].tolist()}
+        primitive = {"attributes": {"POSITION": 0}, "indices": 1, "material": 0}
+        color = {"baseColorFactor": [0.8, 0.8, 0.8, 1], "metallicFactor": 0, "roughnessFactor": 0.6}
+        views = [(0, vertex_bytes, 34962), (vertex_bytes, face_bytes, 34963)]
+        parts = [
+            (5126, self.vertices, {"type": "VEC3", **bounds}),
+            (5125, 3 * self.triangles, {"type": "SCALAR"}),
+        ]
         return {
             "asset": {"version": "2.0", "generator": "gvtorch"},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": [{"mesh": 0, "translation": self._origin.tolist()}],
-            "meshes": [
-                {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "material": 0}]}
-            ],
-            "materials": [
-                {
-                    "pbrMetallicRoughness": {
-                        "baseColorFactor": [0.8, 0.8, 0.8, 1],
-                        "metallicFactor": 0,
-                        "roughnessFactor": 0.6,
-                    }
-                }
-            ],
+            "meshes": [{"primitives": [primitive]}],
+            "materials": [{"pbrMetallicRoughness": color}],
             "buffers": [{"byteLength": vertex_bytes + face_bytes}],
             "bufferViews": [
-                {"buffer": 0, "byteOffset": 0, "byteLength": vertex_bytes, "target": 34962},
-                {
-                    "buffer": 0,
-                    "byteOffset": vertex_bytes,
-                    "byteLength": face_bytes,
-                    "target": 34963,
-                },
+                {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target}
+                for offset, size, target in views
             ],
             "accessors": [
-                {
-                    **{"bufferView": 0, "componentType": 5126, "count": self.vertices},
-                    **{"type": "VEC3", **bounds},
-                },
-                {
-                    **{"bufferView": 1, "componentType": 5125, "count": 3 * self.triangles},
-                    "type": "SCALAR",
-                },
+                {"bufferView": view, "componentType": kind, "count": count, **fields}
+                for view, (kind, count, fields) in enumerate(parts)
             ],
         }

@@ -138,9 +138,7 @@ def _checked_decode(keyframe: Any, decode: Callable[..., Any]) -> Callable[..., 
         if packed and keyframe.compression == _LERC:
             packed = _unpack_lerc(packed, max_lerc_bytes)
         headers = [packed, tables.get("jpegtables"), tables.get("jpegheader")]
-        sizes = [
-            size for header in headers if header and (size := picture_size(header)) is not None
-        ]
+        sizes = [size for header in headers if header and (size := picture_size(header))]
         if packed and not sizes and not is_jpeg:
             raise ValueError(f"tile {number} is not a picture whose size can be read")
         for columns, rows in sizes:
@@ -168,12 +166,8 @@ def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:
     root = ElementTree.fromstring(xml)
     images = [child for child in root.iter() if _tag(child) == "Image"]
     same_name = [image for image in images if image.get("Name") == name]
-    image = (
-        same_name[0] if len(same_name) == 1 else images[number] if number < len(images) else None
-    )
-    pixels = next(
-        (child for child in (() if image is None else image) if _tag(child) == "Pixels"), None
-    )
+    chosen = same_name if len(same_name) == 1 else images[number : number + 1]
+    pixels = next((child for image in chosen for child in image if _tag(child) == "Pixels"), None)
     if pixels is None:
         return ImageInfo(), (1.0, 1.0, 1.0), ["OME-XML, which tells nothing of this image"]
     sizes = [finite_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
@@ -182,15 +176,13 @@ def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:
     dropped = []
     if unit and sizes[2] is None and int(finite_number(pixels.get("SizeZ")) or 1) > 1:
         dropped.append(NO_DEPTH)
-    step, step_unit = (
-        finite_number(pixels.get("TimeIncrement")),
-        pixels.get("TimeIncrementUnit", "s"),
-    )
+    step = finite_number(pixels.get("TimeIncrement"))
+    step_unit = pixels.get("TimeIncrementUnit", "s")
     if step is None and int(finite_number(pixels.get("SizeT")) or 1) > 1:
         step, step_unit = _step_of_planes(pixels)
-    channels = [_ome_channel(child) for child in pixels if _tag(child) == "Channel"]
-    samples = [int(c.get("SamplesPerPixel", 1)) for c in pixels if _tag(c) == "Channel"]
-    if samples == [3] and width == 3:
+    elements = [child for child in pixels if _tag(child) == "Channel"]
+    channels = [_ome_channel(element) for element in elements]
+    if [int(e.get("SamplesPerPixel", 1)) for e in elements] == [3] and width == 3:
         channels = [*color_channels()]
     if any(_tag(child) == "ROI" for child in root):
         dropped.append("regions of interest (ROI)")
@@ -227,12 +219,9 @@ def imagej_info(
     """Reads ImageJ's metadata; `resolution` is the width and height of a pixel."""
     unit = str(metadata.get("unit", "")).replace("\\u00B5", "\u00b5").replace("\\u00b5", "\u00b5")
     distance = finite_number(metadata.get("spacing"))
-    is_calibrated = bool(unit) or distance is not None
-    sizes = [
-        *(resolution if is_calibrated else (None, None)),
-        None if distance is None else abs(distance),
-    ]
-    spacing, unit_name = spacing_of(sizes, [unit] * 3)
+    sides = resolution if unit or distance is not None else (None, None)  # is it calibrated?
+    depth = None if distance is None else abs(distance)
+    spacing, unit_name = spacing_of([*sides, depth], [unit] * 3)
     dropped = []
     if unit and unit_name is None and unit.lower() not in ("pixel", "pixels", "inch"):
         dropped.append(f"the unit {unit!r}, which is unknown")
@@ -243,9 +232,7 @@ def imagej_info(
     tables = metadata.get("LUTs", [])
     channels = []
     for channel in range(width):
-        low, high = (
-            ranges[2 * channel : 2 * channel + 2] if len(ranges) >= 2 * channel + 2 else (0.0, 0.0)
-        )
+        low, high = (*ranges[2 * channel : 2 * channel + 2], 0.0, 0.0)[:2]
         color = _color(tables[channel]) if width > 1 and channel < len(tables) else None
         channels.append(ChannelInfo(color=color, window=(low, high) if low < high else None))
     if any(name in metadata for name in ("Overlays", "ROI")):

@@ -151,9 +151,9 @@ class Handler(http.server.SimpleHTTPRequestHandler):
 
 
 @contextmanager
-def serving(folder: Path) -> Iterator[str]:
-    """Serves a folder within the block; yields its URL."""
-    handler = functools.partial(Handler, directory=str(folder))
+def serving(folder: Path, kind: type[Handler] = Handler) -> Iterator[str]:
+    """Serves a folder within the block, by handlers of a kind; yields its URL."""
+    handler = functools.partial(kind, directory=str(folder))
     server = WebServer(("127.0.0.1", 0), handler)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()

@@ -23,7 +23,7 @@ from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
 from ..cf_source import CfSource, cf_fields
-from ..source import Index, Triple
+from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import is_number
@@ -62,11 +62,8 @@ def _describe_array(folder: str) -> tuple[str, dict[str, Any]] | None:
         file = Path(folder) / name
         if file.is_file():
             metadata = read_json_file(file)
-            is_array = {
-                "zarr3": metadata.get("node_type") == "array",
-                "n5": "dimensions" in metadata,
-            }
-            return (driver, metadata) if is_array.get(driver, True) else None
+            is_array = driver == "zarr" or metadata.get("node_type") == "array"
+            return (driver, metadata) if is_array or "dimensions" in metadata else None
     return None
 
 
@@ -106,18 +103,26 @@ def _is_zarr_group(path: str) -> bool:
     try:
         if (description := _describe_array(path)) is not None:
             return description[0] != "n5"
-        attributes = _read_attributes(path)
+        return not _is_image(path) and bool(_array_names(path))
     except (ValueError, OSError):
         return False  # the OME-Zarr format reports what is wrong
+
+
+def _is_image(folder: str) -> bool:
+    """Returns whether a folder is an OME-NGFF image, or a group of them."""
     image_keys = {"multiscales", "ome", "gvtorch", "bioformats2raw.layout", "plate", "well"}
-    return not image_keys & set(attributes) and bool(_array_names(path))
+    return bool(image_keys & set(_read_attributes(folder)))
 
 
 @Format("Zarr", matches=_is_zarr_group, options=("key", "axes"))
-def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) -> ChunkedSource:
-    """Opens an array, or the array `key` of a group, the only one if left out. `axes` as in
-    `ask_axes`.
+def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) -> VolumeSource:
+    """Opens an array, or the array or OME-NGFF image `key` of a group, the only array if left out.
+    `axes` as in `ask_axes`.
     """
+    if key is not None and axes is None and _is_image(str(Path(path) / key.strip("/"))):
+        from .ome_zarr import open_ome_zarr  # imported here, as its format comes after this one
+
+        return open_ome_zarr(path, key.strip("/"))
     folder = _choose_array(path, key)
     driver, metadata = _describe_array(folder) or ("", {})
     source, shape = _open_source(path, driver, folder)
@@ -133,16 +138,12 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
             sibling = Path(folder).parent / name
             if sibling.parent != Path(folder).parent or name == "..":
                 continue  # the name of an axis must not be a path to another folder
-            if (
-                name
-                and sibling != Path(folder)
-                and (description := _describe_array(str(sibling))) is not None
-            ):
+            is_other = name and sibling != Path(folder)
+            if is_other and (description := _describe_array(str(sibling))) is not None:
                 coordinates, files = _open_array(description[0], str(sibling), source.opened)
                 if coordinates.shape == (shape[axis],) and shape[axis] < 1 << 24:
-                    values = Deadline(_READ_TIMEOUT).wait(
-                        begin_read(coordinates, files), str(sibling)
-                    )
+                    future = begin_read(coordinates, files)
+                    values = Deadline(_READ_TIMEOUT).wait(future, str(sibling))
                     steps[axis] = even_steps(name, values, dropped)
                     units[axis] = str(_read_attributes(str(sibling)).get("units", "")) or None
     axis_order = axis_order or ask_axes(path, shape, axes)
@@ -232,14 +233,9 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
         sizes, origin = (list(transform.get(n) or [])[::-1] for n in ("scale", "translate"))
         unit = transform.get("units")
     unit = unit[0] if isinstance(unit, list) and unit else unit
-    steps = dict(zip(axis_order, _numbers_or_default(sizes, rank, 1.0), strict=True))
-    starts = dict(zip(axis_order, _numbers_or_default(origin, rank, 0.0), strict=True))
-    factors = dict(
-        zip(
-            axis_order,
-            _numbers_or_default(metadata.get("downsamplingFactors"), rank, 1.0),
-            strict=True,
-        )
+    given = ((sizes, 1.0), (origin, 0.0), (metadata.get("downsamplingFactors"), 1.0))
+    steps, starts, factors = (
+        dict(zip(axis_order, _numbers_or_default(*values, rank), strict=True)) for values in given
     )
     voxel_size = [abs(steps.get(a, 1.0) * factors.get(a, 1.0)) for a in "xyz"]
     spacing, unit_name = spacing_of(voxel_size, [unit if isinstance(unit, str) else None] * 3)
@@ -250,6 +246,6 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
     return spacing, (x, y, z), unit_name
 
 
-def _numbers_or_default(values: Any, count: int, default: float) -> list[float]:
+def _numbers_or_default(values: Any, default: float, count: int) -> list[float]:
     is_valid = isinstance(values, list) and len(values) == count and all(map(is_number, values))
     return [float(v) for v in values] if is_valid else [default] * count

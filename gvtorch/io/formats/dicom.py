@@ -42,6 +42,11 @@ class DicomSource(VolumeSource):
     # File, number in it, slope and intercept of each frame, by time, then slice.
     frames: tuple[tuple[str, int, float, float], ...]
 
+    @property
+    def files(self) -> set[str]:
+        """The files of all frames."""
+        return {file for file, *_ in self.frames}
+
     def check_file(self) -> None:
         """Raises ValueError if an uncompressed file is too short for its images, or if their values
         do not begin at the lowest bit.
@@ -191,8 +196,11 @@ def _choose_series(path: str, series: dict[str, list[Any]], key: str | None) -> 
         raise ValueError(f"{path}: no DICOM file in this folder holds an image")
     if key is None and len(series) == 1:
         return next(iter(series.values()))
-    names = {uid: _series_identifiers(uid, headers[0]) for uid, headers in series.items()}
-    matches = [uid for uid, identifiers in names.items() if key is not None and key in identifiers]
+    names = {
+        uid: [str(header.get("SeriesNumber", uid)), str(header.get("SeriesDescription", "")), uid]
+        for uid, (header, *_) in series.items()
+    }
+    matches = [uid for uid, identifiers in names.items() if key in identifiers]
     if len(matches) == 1:
         return series[matches[0]]
     numbers = [identifiers[0] for identifiers in names.values()]
@@ -202,10 +210,6 @@ def _choose_series(path: str, series: dict[str, list[Any]], key: str | None) -> 
         for uid, identifiers in names.items()
     ]
     raise not_chosen(path, "series", listed, key)
-
-
-def _series_identifiers(uid: str, header: Any) -> list[str]:
-    return [str(header.get("SeriesNumber", uid)), str(header.get("SeriesDescription", "")), uid]
 
 
 def _frame_count(header: Any) -> int:

@@ -62,10 +62,8 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         _check_dataset(path, name, dataset)
         shape = tuple(int(n) for n in dataset.shape)
         axis_order, steps, units, dropped = _axes(path, dataset, shape, axes)
-        info, value_fields = (
-            _info(dataset, axis_order, shape),
-            cf_fields(dataset.dtype, dataset.attrs),
-        )
+        info = _info(dataset, axis_order, shape)
+        value_fields = cf_fields(dataset.dtype, dataset.attrs)
         placement, info_fields = axes_placement(axis_order, shape, steps, units)
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
         if info_fields["unit"] is None and len(element_size) == 3:
@@ -212,32 +210,25 @@ def _axes(
         scale = dimension[0] if len(dimension) else None
         attributes = dict(scale.attrs) if scale is not None else {}
         names[axis] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
-        kind = (
-            text_of(attributes.get("axis")).lower()
-            or text_of(attributes.get("standard_name")).lower()
-        )
+        kinds = (text_of(attributes.get(name)).lower() for name in ("axis", "standard_name"))
+        kind = next(filter(None, kinds), "")
         names[axis] = kind if letter_of(kind) != "?" else names[axis]
         units[axis] = text_of(attributes.get("units")) or None
         if text_of(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
             continue
-        if scale is not None:
-            _check_sources(path, scale)
-        if shape[axis] > _MAX_COORDINATES:
+        if scale is None:
             continue
-        if (
-            scale is not None
-            and scale.shape == shape[axis : axis + 1]
-            and scale.dtype.kind in "iuf"
-        ):
+        _check_sources(path, scale)
+        is_fitting = scale.shape == shape[axis : axis + 1] and scale.dtype.kind in "iuf"
+        if is_fitting and shape[axis] <= _MAX_COORDINATES:
             steps[axis] = even_steps(names[axis], scale[()], dropped)
     tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]
         for axis, tag in enumerate(tags):
             size = tag.get("resolution")
-            steps[axis] = (
-                (float(size), 0.0) if isinstance(size, (int, float)) and size > 0 else None
-            )
+            is_positive = isinstance(size, (int, float)) and size > 0
+            steps[axis] = (float(size), 0.0) if is_positive else None
     axis_order = named_axes(names, shape) if axes is None else None
     if axis_order is None and axes is None and rank > 3 and set(shape[:-3]) == {1}:
         axis_order = "-" * (rank - 3) + "zyx"

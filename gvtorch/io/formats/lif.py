@@ -133,11 +133,9 @@ def _channel_axis(path: str, channels: list[Any]) -> _Axis:
 
 def _channel(element: Any) -> ChannelInfo:
     table = str(element.get("LUTName", ""))
-    names = [
-        item.findtext("Value", "")
-        for item in element.iter("ChannelProperty")
-        if item.findtext("Key") in ("DyeName", "Name")
-    ]
+    properties = element.iter("ChannelProperty")
+    named = (item for item in properties if item.findtext("Key") in ("DyeName", "Name"))
+    names = (item.findtext("Value", "") for item in named)
     return ChannelInfo(name=next(filter(None, names), table), color=COLORS.get(table.lower()))
 
 
@@ -157,20 +155,15 @@ def _read_xml(file: IO[bytes]) -> str:
 def _read_blocks(file: IO[bytes], size: int) -> dict[str, tuple[int, int]]:
     """Returns the offset and the size in bytes of each block of numbers, by its name."""
     blocks: dict[str, tuple[int, int]] = {}
-    while file.tell() < size and len(blocks) < _MAX_BLOCKS:
-        header = file.read(13)
-        if len(header) < 13:
+    while (start := file.tell()) < size and len(blocks) < _MAX_BLOCKS:
+        header = file.read(22)  # the block's length has four bytes, or eight
+        layout = "<IIBIBI" if header[13:14] == b"\x2a" else "<IIBQBI"
+        if len(header) < struct.calcsize(layout):
             raise ValueError("ends within a block's head")
-        magic, _, marker, length = struct.unpack("<IIBI", header)
-        if magic != 0x70 or marker != 0x2A:
-            raise ValueError(f"a block's head at {file.tell() - 13} is damaged")
-        next_byte = file.read(1)
-        if next_byte != b"\x2a":  # the length has eight bytes
-            rest = next_byte + file.read(4)
-            length, marker = struct.unpack("<QB", header[9:] + rest)
-            if marker != 0x2A:
-                raise ValueError(f"a block's head at {file.tell()} is damaged")
-        (count,) = struct.unpack("<I", file.read(4))
+        magic, _, marker, length, second_marker, count = struct.unpack_from(layout, header)
+        if magic != 0x70 or not marker == second_marker == 0x2A:
+            raise ValueError(f"a block's head at {start} is damaged")
+        file.seek(start + struct.calcsize(layout))
         name = file.read(2 * min(count, 1 << 12)).decode("utf-16-le")
         offset = file.tell()
         if count > 1 << 12 or offset + length > size:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...base.boxes import box_of
 from ..source import Index, VolumeSource
 from ..stores.ngff import is_zarr
 from .format import Format
@@ -22,7 +23,7 @@ class OmeZarrSource(VolumeSource):
     key: str | None
 
     def read_stored(self, index: Index) -> np.ndarray:
-        low, high = [s.start for s in index[1:4]], [s.stop for s in index[1:4]]
+        low, high = box_of(index[1:4])
         stores = [
             _store(self.path, self.key, self.opened, time)
             for time in range(index[0].start, index[0].stop)

@@ -66,7 +66,7 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
     height, across = min(keyframe.rowsperstrip, length), width
     if keyframe.is_tiled:
         height, across = keyframe.tilelength, keyframe.tilewidth
-    low, high = zip(*((span.start, span.stop) for span in index[:2]), strict=True)
+    low, high = boxes.box_of(index[:2])
     out = np.zeros((*np.subtract(high, low), samples), keyframe.dtype)
     for row, column in boxes.tile_indices(low, high, (height, across)):
         tile = _unpack_tile(page, keyframe, row * -(-width // across) + column)

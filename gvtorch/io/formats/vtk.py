@@ -68,11 +68,10 @@ class VtkSource(VolumeSource):
                 content = file.read()
         if self.encoding == "ascii":
             text = io.BytesIO(content)
-            return text_numbers(self.path, text, count, self.stored, exact=True).reshape(
-                self.shape
-            )[index]
-        data = self._unpack(content, count * dtype.itemsize)
-        return np.frombuffer(data, dtype).reshape(self.shape)[index]
+            numbers = text_numbers(self.path, text, count, self.stored, exact=True)
+        else:
+            numbers = np.frombuffer(self._unpack(content, count * dtype.itemsize), dtype)
+        return numbers.reshape(self.shape)[index]
 
     def _unpack(self, content: bytes, needed_bytes: int) -> bytes:
         item_bytes = np.dtype(self.size_dtype).itemsize
@@ -80,20 +79,15 @@ class VtkSource(VolumeSource):
             content = re.split(rb"[<\s]", content.strip(), maxsplit=1)[0]
         if not self.compressor:
             decoded = _decode(content, self.encoding, item_bytes + needed_bytes)
-            declared = int(np.frombuffer(decoded[:item_bytes], self.size_dtype)[0])
+            declared = self._sizes(content, 1)[0]
             if declared != needed_bytes or len(decoded) < item_bytes + needed_bytes:
                 raise ValueError(f"{self.path}: {needed_bytes} bytes expected, {declared} found")
             return decoded[item_bytes : item_bytes + needed_bytes]
-        block_count = int(
-            np.frombuffer(_decode(content, self.encoding, item_bytes), self.size_dtype)[0]
-        )
+        block_count = self._sizes(content, 1)[0]
         if not 1 <= block_count <= len(content):
             raise ValueError(f"{self.path}: {block_count} blocks in {len(content)} bytes")
         table_bytes = (3 + block_count) * item_bytes
-        table = np.frombuffer(
-            _decode(content, self.encoding, table_bytes), self.size_dtype
-        ).tolist()
-        block_size, last_size, packed_sizes = table[1], table[2], table[3:]
+        _, block_size, last_size, *packed_sizes = self._sizes(content, 3 + block_count)
         unpacked_sizes = [block_size] * (block_count - 1) + [last_size or block_size]
         if sum(unpacked_sizes) != needed_bytes:
             raise ValueError(
@@ -105,13 +99,17 @@ class VtkSource(VolumeSource):
         start = table_bytes if self.encoding == "raw" else -(-table_bytes // 3) * 4
         data, parts, position = _decode(content[start:], self.encoding, sum(packed_sizes)), [], 0
         for packed_size, unpacked_size in zip(packed_sizes, unpacked_sizes, strict=True):
-            parts.append(
-                unpack_block(
-                    self.compressor, data[position : position + packed_size], unpacked_size
-                )
-            )
+            packed = data[position : position + packed_size]
+            parts.append(unpack_block(self.compressor, packed, unpacked_size))
             position += packed_size
         return b"".join(parts)
+
+    def _sizes(self, content: bytes, count: int) -> list[int]:
+        """Returns the first `count` sizes before the data."""
+        size_dtype = np.dtype(self.size_dtype)
+        table = _decode(content, self.encoding, count * size_dtype.itemsize)
+        sizes: list[int] = np.frombuffer(table, size_dtype, count).tolist()
+        return sizes
 
 
 def _decode(content: bytes, encoding: str, count: int) -> bytes:

@@ -78,9 +78,21 @@ def convert_channels(
         raise ValueError(
             f"a channel's name is made of letters, digits, - and _, got {invalid[0]!r}"
         )
+    unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
+    with unfinished.claimed_folder(target):
+        _write_channels(sources, target, resume, progress, options)
+    return Store.open(target)
+
+
+def _write_channels(
+    sources: Mapping[str, VolumeSource],
+    target: Path,
+    resume: bool,
+    progress: Progress,
+    options: dict[str, Any],
+) -> None:
+    """Writes the channels into a folder that no other process writes to."""
     begun = unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
-    target.mkdir(exist_ok=True)
-    (target / WORK).mkdir(exist_ok=True)
     manifest = target / WORK / _MANIFEST
     fingerprints = unfinished.as_json(
         {name: source.fingerprint() for name, source in sources.items()}
@@ -109,7 +121,6 @@ def convert_channels(
     root = {"ome": {"version": "0.5", "bioformats2raw.layout": 3}, CHANNELS_ATTRIBUTE: [*sources]}
     unfinished.write_json(target / "zarr.json", unfinished.group_metadata(root))
     shutil.rmtree(target / WORK, ignore_errors=True)
-    return Store.open(target)
 
 
 def _channel_progress(

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .chunk_files import file_limit, index_bytes
+from .chunk_files import ChunkFiles
 from .ngff import read_json
 from .store_layout import StoreLayout
 from .tensorstores import Deadline, StoreError, read_key
@@ -48,11 +48,10 @@ def shard_checksums(
 
 def shard_path(spec: Mapping[str, Any], index: tuple[int, ...]) -> str:
     """Returns the path of a shard's file in the store."""
-    shape, dimension_names = spec["metadata"]["shape"], spec["metadata"].get("dimension_names", "")
     file_index = list(index)
-    if "c" in dimension_names:  # each shard holds all channels
+    if "c" in spec["metadata"].get("dimension_names", ""):  # each shard holds all channels
         file_index.insert(len(file_index) - 3, 0)
-    file_index += [0] * (len(shape) - len(file_index))
+    file_index += [0] * (len(spec["metadata"]["shape"]) - len(file_index))
     return "/".join(map(str, (spec["path"], "c", *file_index)))
 
 
@@ -61,12 +60,9 @@ def _read_covered_bytes(
 ) -> Any:
     """Reads the bytes of a file that its checksum covers; None: there is no such file."""
     metadata = spec["metadata"]
-    shard_values = math.prod(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-    chunk_values = math.prod(metadata["codecs"][0]["configuration"]["chunk_shape"])
-    is_cells = spec["path"].startswith("gvtorch/cells")
-    byte_range = None if is_cells else slice(-index_bytes(shard_values, chunk_values), None)
-    max_bytes = file_limit(shard_values, chunk_values, np.dtype(metadata["data_type"]).itemsize)
-    return read_key(location, root, path, deadline, byte_range, max_bytes)
+    files = ChunkFiles.of_zarr3("", metadata, np.dtype(metadata["data_type"]).itemsize)
+    byte_range = None if spec["path"].startswith("gvtorch/cells") else files.index_part
+    return read_key(location, root, path, deadline, byte_range, files.max_bytes)
 
 
 class Checksums:

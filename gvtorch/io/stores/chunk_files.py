@@ -8,11 +8,10 @@ Source: Blosc, README_CHUNK_FORMAT; Zarr 3, sharding codec; N5 specification.
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -30,32 +29,22 @@ _MISSING_OFFSET = 2**63  # offsets from here on mark missing chunks
 _BLOSC_HEADER_BYTES = 8  # that are read of its header; the last four are the unpacked size
 
 
-def index_bytes(values: int, chunk_values: int, *, summed: bool = True) -> int:
-    """Returns the size in bytes of a shard's index: `values` values, `chunk_values` in a chunk."""
-    return _ENTRY_BYTES * (values // max(1, chunk_values)) + _CHECKSUM_BYTES * summed
-
-
-def file_limit(values: int, chunk_values: int, item_bytes: int) -> int:
-    """Returns the most bytes that a file may have, of `values` values of `item_bytes` each, plus
-    the index of its chunks of `chunk_values` values: no codec doubles the size of its input.
-    """
-    return 2 * values * item_bytes + index_bytes(values, chunk_values) + EXTRA_BYTES
-
-
-def check_file(path: str, max_bytes: int) -> int | None:
+def check_file(path: str, max_bytes: int, name: str = "") -> int | None:
     """Returns the size of a file in bytes; None if there is none. Follows links.
 
     Raises:
-        Endless: It is a folder, a pipe, a device, or longer than `max_bytes`.
+        Endless: It is a folder, a pipe, a device, or longer than `max_bytes`; the message begins
+            with `name`, if given.
     """
     try:
         status = os.stat(path)
     except (OSError, ValueError):
         return None  # if this is an error, tensorstore reports it
+    prefix = f"{name}: " if name else ""
     if not stat.S_ISREG(status.st_mode):
-        raise Endless("is not a regular file")
+        raise Endless(f"{prefix}is not a regular file")
     if status.st_size > max_bytes:
-        raise Endless(f"takes {status.st_size} bytes, more than the {max_bytes} that fit")
+        raise Endless(f"{prefix}takes {status.st_size} bytes, more than the {max_bytes} that fit")
     return status.st_size
 
 
@@ -133,7 +122,7 @@ class ChunkFiles:
         folder = spec["kvstore"]["path"] if spec["kvstore"]["driver"] == "file" else ""
         metadata, driver = spec["metadata"], spec["driver"]
         if driver == "zarr3":
-            return cls(folder=folder, item_bytes=item_bytes, **_fields_of_zarr3(metadata))
+            return cls.of_zarr3(folder, metadata, item_bytes)
         file = tuple(metadata["chunks" if driver == "zarr" else "blockSize"])
         compressor = metadata["compressor" if driver == "zarr" else "compression"] or {}
         return cls(
@@ -146,6 +135,37 @@ class ChunkFiles:
             n5=driver == "n5",
         )
 
+    @classmethod
+    def of_zarr3(cls, folder: str, metadata: Mapping[str, Any], item_bytes: int) -> ChunkFiles:
+        """Reads an array's zarr.json; raises as `of`."""
+        file = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
+        key_encoding = metadata.get("chunk_key_encoding", {"name": "default"})
+        is_default = key_encoding["name"] == "default"
+        separator = key_encoding.get("configuration", {}).get(
+            "separator", "/" if is_default else "."
+        )
+        codecs, shard = metadata["codecs"], dict[str, Any](chunk=file)
+        if codecs[-1]["name"] == "sharding_indexed":
+            inner = codecs[-1]["configuration"]
+            index = inner["index_codecs"]
+            is_big_endian = any(
+                codec.get("configuration", {}).get("endian") == "big" for codec in index
+            )
+            shard = {
+                "chunk": tuple(inner["chunk_shape"]),
+                "index": inner.get("index_location", "end"),
+                "order": ">" if is_big_endian else "<",
+                "summed": any(codec["name"] == "crc32c" for codec in index),
+                "transposed": len(codecs) > 1,
+            }
+            codecs = inner["codecs"]
+        *outer, innermost = [name for name in _codec_names(codecs) if name != "crc32c"]
+        if "blosc" in outer:
+            raise Endless(f"Blosc lies inside {innermost}, where its output can't be checked")
+        begin, blosc = f"c{separator}" if is_default else "", innermost == "blosc"
+        names = {"folder": folder, "begin": begin, "separator": separator}
+        return cls(file=file, item_bytes=item_bytes, blosc=blosc, **names, **shard)
+
     @cached_property
     def chunks(self) -> int:
         """Number of chunks in a file."""
@@ -153,8 +173,9 @@ class ChunkFiles:
 
     @cached_property
     def max_bytes(self) -> int:
-        """Bytes of a file, at most."""
-        return file_limit(math.prod(self.file), math.prod(self.chunk), self.item_bytes)
+        """Bytes of a file, at most: its values, its index and more; no codec doubles its input."""
+        value_bytes = math.prod(self.file) * self.item_bytes
+        return 2 * value_bytes + _ENTRY_BYTES * self.chunks + EXTRA_BYTES
 
     @cached_property
     def chunk_bytes(self) -> int:
@@ -164,7 +185,7 @@ class ChunkFiles:
     @cached_property
     def index_bytes(self) -> int:
         """Bytes of a shard's index."""
-        return index_bytes(math.prod(self.file), math.prod(self.chunk), summed=self.summed)
+        return _ENTRY_BYTES * self.chunks + _CHECKSUM_BYTES * self.summed
 
     @property
     def index_part(self) -> slice:
@@ -197,17 +218,17 @@ class ChunkFiles:
         Raises:
             Endless: A file is not a regular one, or is too long, or Blosc would unpack too much.
         """
-        chunks_by_file = (
-            self._files_of_chunks(part)
-            if isinstance(part, np.ndarray)
-            else self._files_of_part(part)
-        )
-        for file_index, chunks in chunks_by_file:
-            name = f"{self.begin}{self.separator.join(map(str, file_index))}"
+        chunks = part if isinstance(part, np.ndarray) else self._chunks_of_part(part)
+        count, strides = self._counts_and_strides
+        files = chunks // count
+        numbers = (chunks - files * count) @ strides
+        for file_index, rows in zip(*group_rows(files), strict=True):
+            name = f"{self.begin}{self.separator.join(map(str, file_index.tolist()))}"
             try:
                 size = check_file(self.folder + name, self.max_bytes)
                 if size is not None and self.blosc:
-                    self._check_chunk_headers(self.folder + name, size, chunks)
+                    in_file = np.arange(self.chunks) if self.transposed else numbers[rows]
+                    self._check_chunk_headers(self.folder + name, size, in_file)
             except Endless as error:
                 raise Endless(f"{name}: {error}") from None
 
@@ -232,56 +253,45 @@ class ChunkFiles:
             [content[start - begin : start - begin + _BLOSC_HEADER_BYTES] for start in starts]
         )
 
-    @cached_property
-    def _all_chunks(self) -> np.ndarray | None:
-        """Numbers of all chunks of a file, if files are checked as a whole: if they are not shards,
-        or transposed ones, where chunks can't be matched to a part of the array. Else None.
+    @property
+    def _counted(self) -> tuple[int, ...]:
+        """Values along each axis of what is counted as a chunk: files of transposed shards, whose
+        chunks can't be matched to a part of the array.
         """
-        return np.arange(self.chunks) if self.transposed or not self.index else None
+        return self.file if self.transposed else self.chunk
 
     @cached_property
     def _counts_and_strides(self) -> tuple[np.ndarray, np.ndarray]:
-        """(axes,) chunks of a file along each axis (1 if files are checked as a whole), and the
-        stride of a chunk's number in its file along each axis.
+        """(axes,) chunks of a file along each axis, and the stride of a chunk's number in it."""
+        count = np.floor_divide(self.file, self._counted)
+        return count, np.cumprod(count[::-1])[::-1] // count
+
+    def _chunks_of_part(self, transform: Any) -> np.ndarray:
+        """Returns (n, axes) indices of the chunks that hold the part of the array that an
+        IndexTransform of tensorstore maps.
         """
-        count = [a // b for a, b in zip(self.file, self.chunk, strict=True)]
-        strides = [math.prod(count[axis + 1 :]) for axis in range(len(count))]
-        if self._all_chunks is not None:  # each file counts as one chunk
-            count = [1] * len(count)
-        return np.array(count, np.int64), np.array(strides, np.int64)
-
-    def _files_of_chunks(self, chunks: np.ndarray) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """Yields the index of each file that holds chunks (n, axes), and their numbers in it."""
-        count, strides = self._counts_and_strides
-        files = chunks // count
-        for file_index, numbers in _group_by_row(files, (chunks - files * count) @ strides):
-            yield file_index, numbers if self._all_chunks is None else self._all_chunks
-
-    def _files_of_part(self, transform: Any) -> Iterator[tuple[Sequence[int], np.ndarray]]:
-        """Yields the same for the part of the array that an IndexTransform of tensorstore maps."""
-        counted_shape = self.chunk if self._all_chunks is None else self.file
-        counts, strides = self._counts_and_strides
-        count = counts.tolist()
-        spans, indexed_axes, chunk_rows = _chunks_of_part(transform, counted_shape)
-        files = [
-            range(span.start // n, (span.stop - 1) // n + 1)
-            for span, n in zip(spans, count, strict=True)
-        ]
-        file_rows = chunk_rows // counts[indexed_axes]
-        numbers_in_file = (chunk_rows - file_rows * counts[indexed_axes]) @ strides[indexed_axes]
-        for file_row, numbers_in_row in _group_by_row(file_rows, numbers_in_file):
-            for axis, file in zip(indexed_axes, file_row, strict=True):
-                files[axis] = range(file, file + 1)
-            for file_index in itertools.product(*files):
-                chunk_numbers = numbers_in_row
-                for axis in set(range(len(count))) - set(indexed_axes):
-                    first = file_index[axis] * count[axis]
-                    low = max(spans[axis].start - first, 0)
-                    high = min(spans[axis].stop - first, count[axis])
-                    if high > 1:
-                        offsets = strides[axis] * np.arange(low, high)
-                        chunk_numbers = np.add.outer(chunk_numbers, offsets).ravel()
-                yield file_index, chunk_numbers if self._all_chunks is None else self._all_chunks
+        origin, shape = transform.input_origin, transform.input_shape
+        spans, indexed = dict[int, np.ndarray](), dict[int, np.ndarray]()
+        for axis, (output, n) in enumerate(zip(transform.output, self._counted, strict=True)):
+            if output.index_array is not None:
+                positions = output.offset + output.stride * np.asarray(output.index_array)
+                indexed[axis] = positions // n
+                continue
+            ends = [output.offset] * 2
+            if (dimension := output.input_dimension) is not None:
+                first, last = origin[dimension], origin[dimension] + shape[dimension] - 1
+                ends = [output.offset + output.stride * end for end in (first, last)]
+            spans[axis] = np.arange(min(ends) // n, max(ends) // n + 1)
+        columns = [part.ravel() for part in np.broadcast_arrays(*indexed.values())]
+        rows = np.zeros((1, 0), np.int64)
+        if columns:
+            rows = group_rows(np.stack(columns, axis=1))[0]
+        grid = np.meshgrid(np.arange(len(rows)), *spans.values(), indexing="ij")
+        chunks = np.empty((grid[0].size, len(self.chunk)), np.int64)
+        chunks[:, [*indexed]] = rows[grid[0].ravel()]
+        for axis, part in zip(spans, grid[1:], strict=True):
+            chunks[:, axis] = part.ravel()
+        return chunks
 
     def _check_chunk_headers(self, path: str, size: int, chunks: np.ndarray) -> None:
         try:
@@ -328,82 +338,8 @@ class ChunkFiles:
             )
 
 
-def _fields_of_zarr3(metadata: dict[str, Any]) -> dict[str, Any]:
-    """Returns fields of `ChunkFiles` from an array's zarr.json."""
-    file = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-    key_encoding = metadata["chunk_key_encoding"]
-    is_default = key_encoding["name"] == "default"
-    separator = key_encoding.get("configuration", {}).get("separator", "/" if is_default else ".")
-    codecs, shard = metadata["codecs"], dict[str, Any](chunk=file)
-    if codecs[-1]["name"] == "sharding_indexed":
-        inner = codecs[-1]["configuration"]
-        index = inner["index_codecs"]
-        is_big_endian = any(
-            codec.get("configuration", {}).get("endian") == "big" for codec in index
-        )
-        shard = {
-            "chunk": tuple(inner["chunk_shape"]),
-            "index": inner.get("index_location", "end"),
-            "order": ">" if is_big_endian else "<",
-            "summed": any(codec["name"] == "crc32c" for codec in index),
-            "transposed": len(codecs) > 1,
-        }
-        codecs = inner["codecs"]
-    *outer, innermost = [name for name in _codec_names(codecs) if name != "crc32c"]
-    if "blosc" in outer:
-        raise Endless(f"Blosc lies inside {innermost}, where its output can't be checked")
-    begin = f"c{separator}" if is_default else ""
-    return {
-        **shard,
-        "begin": begin,
-        "separator": separator,
-        "file": file,
-        "blosc": innermost == "blosc",
-    }
-
-
 def _codec_names(codecs: Iterable[dict[str, Any]]) -> Iterator[str]:
     """Yields the names of codecs, nested ones before the codec that holds them."""
     for codec in codecs:
         yield from _codec_names(codec.get("configuration", {}).get("codecs", ()))
         yield codec["name"]
-
-
-def _chunks_of_part(
-    transform: Any, chunk_shape: Sequence[int]
-) -> tuple[list[range], list[int], np.ndarray]:
-    """Returns the chunks of `chunk_shape` values that hold a part of an array: a range of chunk
-    indices for each axis; the axes that index arrays select instead; and (n, axes) chunk indices
-    along those.
-    """
-    spans, indexed_axes, index_arrays = [], [], []
-    origin, shape = transform.input_origin, transform.input_shape
-    for axis, (output, n) in enumerate(zip(transform.output, chunk_shape, strict=True)):
-        bounds = (output.offset, output.offset)
-        if output.index_array is not None:
-            indexed_axes.append(axis)
-            index_arrays.append(
-                (output.offset + output.stride * np.asarray(output.index_array)) // n
-            )
-        elif output.input_dimension is not None:
-            low, n_along = origin[output.input_dimension], shape[output.input_dimension]
-            bounds = (
-                output.offset + output.stride * low,
-                output.offset + output.stride * (low + n_along - 1),
-            )
-        spans.append(range(min(bounds) // n, max(bounds) // n + 1))
-    if not indexed_axes:
-        return spans, indexed_axes, np.zeros((1, 0), np.int64)
-    columns = [indices.ravel() for indices in np.broadcast_arrays(*index_arrays)]
-    return spans, indexed_axes, np.stack(columns, axis=1)
-
-
-def _group_by_row(rows: np.ndarray, numbers: np.ndarray) -> Iterator[tuple[list[int], np.ndarray]]:
-    """Yields each distinct row of `rows` (n, k), with those of `numbers` (n,) that belong to it."""
-    if (rows == rows[:1]).all():
-        if len(rows):
-            yield rows[0].tolist(), numbers
-        return
-    distinct_rows, members = group_rows(rows)
-    for row, selected in zip(distinct_rows.tolist(), members, strict=True):
-        yield row, numbers[selected]

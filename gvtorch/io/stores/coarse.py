@@ -99,8 +99,10 @@ def make_channel(
 
 @contextmanager
 def _levels_in_files(store: Store, fill_width: int) -> Iterator[Sequence[np.ndarray]]:
-    """Yields an array for each coarse level, mapped from temporary files in the store's folder."""
-    folder = Path(store.location) / WORK
+    """Yields an array for each coarse level, mapped from temporary files in the folder that is
+    locked.
+    """
+    folder = Path(store.location) / store.coarse_folder / WORK
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     try:

@@ -102,6 +102,7 @@ def convert(
     if resume and unfinished.is_finished(target) and (finished := Store.open(target)).has_blocks:
         with suppress(FileNotFoundError):  # the source may be gone once the store is finished
             _check_finished(finished, make_source(read=False), block, threshold)
+        shutil.rmtree(target / WORK, ignore_errors=True)  # left if it was killed in its last step
         return finished
     begun = unfinished.is_begun(target, resume=resume)
     prepared = indexed_source(make_source(), time, workers, target / WORK, progress)
@@ -242,7 +243,7 @@ def _write_levels(
                     done += result.voxels * layout.voxel_bytes
                     progress("converting", done, total)
         if bad_values:
-            shutil.rmtree(plan.target, ignore_errors=True)
+            unfinished_store.discard()
             raise ValueError(
                 f"{plan.settings['source']}: {bad_values} values are NaN or infinite (of "
                 f"{layout.times * math.prod(layout.extent) * layout.width}); pass nan=VALUE "

@@ -8,7 +8,6 @@ import shutil
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -16,16 +15,14 @@ from typing import Any
 import numpy as np
 
 from ...base import check
-from ...base.labels import background
 from ...base.volume import Volume
-from ...pool.downsample import pool_majority, pool_mean
 from .. import resources
 from ..label_source import IndexSource
 from ..oblique import Oblique, StraightSource
 from ..reading import FormatSettings, open_source, read_time_points, with_placement
-from ..source import MemorySource, VolumeSource, no_time_message
+from ..source import MemorySource, VolumeSource, check_time
 from . import shard, unfinished
-from .level_reader import Pool
+from .level_reader import pool_of
 from .store_layout import BLOCKS, DTYPES, StoreLayout
 from .tensorstores import context, kvstore
 
@@ -100,8 +97,7 @@ def source_of(
     if isinstance(source, VolumeSource):
         return source
     if isinstance(source, Volume):
-        if time not in (None, 0):
-            raise ValueError(no_time_message(source.name, time, 1))
+        check_time(source.name, 0 if time is None else time, 1)
         if labels and not source.info.labels:
             raise ValueError("convert: the volume must hold labels: gv.Volume(data, labels=True)")
         if source.filter == "directional":
@@ -173,7 +169,7 @@ def plan_of(
     fields = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
-        "fingerprint": _fingerprint(user_source, source),
+        "fingerprint": _fingerprint(user_source, source, target),
         **{name: getattr(source, name) for name in fields},
         "unit": source.info.unit,
         "times": layout.times,
@@ -185,10 +181,7 @@ def plan_of(
         "labels": source.info.labels,
         "tasks": sum(tasks),
     }
-    pool: Pool = pool_mean
-    if source.info.labels:
-        pool = partial(pool_majority, background=background(label_values))
-    root = kvstore(target)
+    root, pool = kvstore(target), pool_of(source.info, label_values)
     return Plan(
         target=target,
         task=shard.Conversion(root=root, layout=layout, source=source, nan=nan, pool=pool),
@@ -300,7 +293,7 @@ def check_room(target: Path, estimate: Estimate) -> None:
         )
 
 
-def _fingerprint(user_source: Any, source: VolumeSource) -> list[Any]:
+def _fingerprint(user_source: Any, source: VolumeSource, target: Path) -> list[Any]:
     """Returns values that are equal while a source, and what is read of it, are unchanged."""
     fingerprint = source.fingerprint()
     if fingerprint is not None:
@@ -309,12 +302,14 @@ def _fingerprint(user_source: Any, source: VolumeSource) -> list[Any]:
         return unfinished.fingerprint(user_source)
     is_file = isinstance(user_source, (str, Path))
     fields: list[Any] = [list(source.shape), source.stored]
-    fields = unfinished.fingerprint(source.path) if is_file else fields
+    fields = unfinished.fingerprint(source.path, target) if is_file else fields
     while isinstance(source, (IndexSource, StraightSource)):
         source = source.inner
     if isinstance(source, MemorySource):
         return [*fields, unfinished.checksum([source.data])]
-    if (file := getattr(source, "file", source.path)) != source.path:  # beside its header
-        fields += unfinished.fingerprint(file)
+    if not Path(source.path).is_dir():  # files beside the one that was named
+        files = {getattr(source, "file", source.path), *getattr(source, "files", ())}
+        for file in sorted(files - {source.path}):
+            fields += unfinished.fingerprint(file)
     # What is read of it: the chosen array, its axes, byte order, ...
     return [*fields, zlib.crc32(repr(source).replace(source.path, "").encode())]

@@ -12,22 +12,32 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ...base import boxes, check
 from ...base.boxes import Zyx
-from ...base.labels import check_narrowed
-from ..source import no_time_message
+from ...base.image_info import ImageInfo
+from ...base.labels import background, check_narrowed
+from ...pool.downsample import pool_majority, pool_mean
+from ..source import check_time
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
-from .store_layout import MAX_STORE_VOXELS, StoreLayout
+from .store_layout import MAX_STORE_VOXELS, StoreLayout, value_dtype
 from .tensorstores import Deadline, StoreError, begin_open, child, one_line_error
 
 Pool = Callable[[np.ndarray, int | Sequence[int]], np.ndarray]
 _TILE_SIDE = 64  # voxels along a side of a tile that is computed on demand
 _CACHE_BYTES = 128 << 20  # bytes of cached tiles
+
+
+def pool_of(info: ImageInfo, label_values: np.ndarray | None) -> Pool:
+    """Returns what makes coarser voxels of an image: the mean, or the most frequent label."""
+    if not info.labels:
+        return pool_mean
+    return partial(pool_majority, background=background(label_values))
 
 
 @dataclass(frozen=True)
@@ -62,8 +72,9 @@ def open_arrays(
     deadline: Deadline,
 ) -> tuple[list[StoredArray], slice | list[int], dict[str, int]]:
     """Opens the image's arrays, the finest first, at one time point, without those that are not
-    coarser by whole factors; returns them, the index of their channels, and the image's size along
-    each axis. Metadata is checked before memory is allocated.
+    coarser by whole factors, or whose place, dtype, times or channels differ. Returns them, the
+    index of their channels, and the image's size along each axis. Metadata is checked before memory
+    is allocated.
     """
     finest = image.scales[0]
     folder = child(root, finest.path)
@@ -78,9 +89,13 @@ def open_arrays(
         except StoreError as error:
             raise ValueError(f"{context}: can't be opened: {one_line_error(error)}") from None
         files = _check_array(context, array, image.axes)
+        level_sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
+        level_dtype = value_dtype(array.dtype.numpy_dtype)
         if not stored:
             channel_index = _channel_index(location, array, image.axes, time, channels)
-            sizes = dict(zip(image.axes, map(int, array.shape), strict=True))
+            sizes, dtype = level_sizes, level_dtype
+        elif level_dtype != dtype or any(level_sizes.get(a) != sizes.get(a) for a in "tc"):
+            continue
         selection: dict[str, Any] = {"t": time, "c": channel_index, "-": 0}
         # An index array of channels would move its axis: oindex leaves every axis in place.
         array = array.oindex[tuple(selection.get(axis, slice(None)) for axis in image.axes)]
@@ -126,8 +141,7 @@ def _channel_index(
 ) -> slice | list[int]:
     size = {axis: int(n) for axis, n in zip(axes, array.shape, strict=True)}
     times, width = size.get("t", 1), size.get("c", 1)
-    if isinstance(time, bool) or not isinstance(time, int) or not 0 <= time < times:
-        raise ValueError(no_time_message(context, time, times))
+    check_time(context, time, times)
     if channels is None:
         return slice(None)
     selected = list(check.instance(context, "channels", channels, tuple, list, range))
@@ -139,9 +153,14 @@ def _channel_index(
 def _factors(
     first: StoredArray, other: StoredArray, fine: ImageArray, coarse: ImageArray
 ) -> tuple[int, int, int] | None:
-    """Returns whole factors (z, y, x) between the finest array and another; None if not whole."""
+    """Returns whole factors (z, y, x) between the finest array and another; None if not whole, or
+    if the other lies elsewhere, by more than one of its voxels.
+    """
     factors = []
-    for axis, a, b in zip("zyx", fine.scale, coarse.scale, strict=True):
+    shifts = [b - a for a, b in zip(fine.translation, coarse.translation, strict=True)]
+    for axis, a, b, shift in zip("zyx", fine.scale, coarse.scale, shifts, strict=True):
+        if not abs(shift) <= max(a, b):
+            return None
         fine_size, coarse_size = first.size(axis), other.size(axis)
         # Sizes are the fallback for scales; a partial last voxel may have been dropped.
         for ratio in (b / a, fine_size / coarse_size):

@@ -16,10 +16,10 @@ from typing import Any
 
 from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
 from ...base.units import length_unit, metres, time_unit
-from ..http import Endless
+from ..http import Endless, file_url, is_forbidden, refused
 from ..remote import is_file_url
 from .store_layout import JOURNAL, MANIFEST, RESUME_ADVICE, WORK, StoreLayout, is_number
-from .tensorstores import MAX_JSON_BYTES, Deadline, child, read_key
+from .tensorstores import MAX_JSON_BYTES, Deadline, StoreError, child, read_key
 
 CHANNELS_ATTRIBUTE = "gvtorch_channels"  # names the images of a store of several channels
 _MAX_LEVELS = 64
@@ -33,8 +33,8 @@ class ImageArray:
     """One array of a multiscale image."""
 
     path: str
-    scale: tuple[float, float, float]  # z y x
-    translation: tuple[float, float, float]  # z y x
+    scale: tuple[float, ...]  # z y x
+    translation: tuple[float, ...]  # z y x
 
 
 @dataclass
@@ -73,27 +73,16 @@ def find_image(
     attributes = _attributes(location, root, deadline)
     if attributes is None:
         raise _no_store_error(location, root, deadline)
-    store_json = attributes.get("gvtorch")
-    layout = None if store_json is None else StoreLayout.parse(location, store_json)
-    pyramid = _parse_image(location, attributes, image)
-    series = _ngff_attribute(attributes, "bioformats2raw.layout")
-    if pyramid is None and layout is None:
-        # "0" is the folder that bioformats2raw uses.
-        folders = attributes.get(CHANNELS_ATTRIBUTE, ["0"])
-        has_names = isinstance(folders, list) and folders and isinstance(folders[0], str)
-        folder = image if image is not None else folders[0] if has_names else "0"
-        if ".." not in folder and not folder.startswith("/"):
-            parent, root = root, child(root, folder)
-            folder_attributes = _attributes(f"{location}/{folder}", root, deadline)
-            pyramid = _parse_image(location, folder_attributes, None) if folder_attributes else None
-            store_json = folder_attributes.get("gvtorch") if folder_attributes else None
-            layout = (
-                None
-                if store_json is None
-                else StoreLayout.parse(f"{location}/{folder}", store_json)
-            )
-            if pyramid is not None and image is None and series is not None:
-                _note_other_images(pyramid, _other_images(location, parent, deadline, folder))
+    group = attributes
+    pyramid, layout = _parse_group(location, group, image)
+    if pyramid is None:
+        folders = _image_folders(location, root, group, deadline) if image is None else [image]
+        if ".." not in folders[0] and not folders[0].startswith("/"):
+            root, inner = child(root, folders[0]), f"{location}/{folders[0]}"
+            group = _attributes(inner, root, deadline) or {}
+            pyramid, layout = _parse_group(inner, group, None)
+            if pyramid is not None:
+                _note_other_images(pyramid, folders[1:])
     if pyramid is None:
         problem = "no multiscale image" if image is None else f"no image {image!r}"
         plate = "; it is a plate: name a field of view, as in 'A/1/0'"
@@ -101,22 +90,28 @@ def find_image(
         names = _image_names(attributes) if image is not None else []
         names_hint = f"; it holds {_join_some(names)}" if names else ""
         raise ValueError(f"{location}: has {problem} (NGFF multiscales){names_hint}{plate_hint}")
-    if layout is not None and isinstance(store_json, dict):
-        pyramid.info, pyramid.store_json = (
-            _stored_info(store_json.get("info"), pyramid.info),
-            store_json,
-        )
-    else:
-        pyramid.dropped += _label_notes(location, root, deadline)
+    if layout is not None:
+        pyramid.store_json = group["gvtorch"]
+        pyramid.info = _stored_info(pyramid.store_json.get("info"), pyramid.info)
+    pyramid.dropped += _label_notes(location, root, deadline)
     return root, pyramid, layout
 
 
 def read_json(
     location: str, root: Any, name: str, deadline: Deadline, max_bytes: int = MAX_JSON_BYTES
 ) -> dict[str, Any] | None:
-    """Reads a JSON object from a file in a folder, as `parse_json`; None if there is no file."""
-    content = read_key(location, root, name, deadline, max_bytes=max_bytes)
-    return None if content is None else parse_json(f"{location}/{name}", content, max_bytes)
+    """Reads a JSON object from a file in a folder, as `parse_json`; None if there is no file, which
+    servers also tell by 403, or by sending a page in its place.
+    """
+    try:
+        content = read_key(location, root, name, deadline, max_bytes=max_bytes)
+    except StoreError as error:
+        if isinstance(root, str) and is_forbidden(error):
+            return None
+        raise
+    if content is None or (isinstance(root, str) and content.lstrip()[:1] == b"<"):
+        return None
+    return parse_json(f"{location}/{name}", content, max_bytes)
 
 
 def parse_json(location: str, content: bytes, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
@@ -146,10 +141,12 @@ def read_json_file(file: Path) -> dict[str, Any]:
 
 
 def _attributes(location: str, root: Any, deadline: Deadline) -> dict[str, Any] | None:
-    """Returns a group's attributes, from zarr.json (v3) or .zattrs (v2)."""
+    """Returns a group's attributes, from zarr.json (v3) or .zattrs (v2), which a group may lack."""
     group = read_json(location, root, "zarr.json", deadline)
     if group is None:
-        return read_json(location, root, ".zattrs", deadline)
+        attributes = read_json(location, root, ".zattrs", deadline)
+        is_group = attributes is None and read_json(location, root, ".zgroup", deadline) is not None
+        return {} if is_group else attributes
     attributes = group.get("attributes", {})
     if group.get("node_type") != "group" or not isinstance(attributes, dict):
         raise ValueError(f"{location}: zarr.json is that of no group; expected an OME-Zarr image")
@@ -162,12 +159,25 @@ def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     work_folder = child(root, WORK)
     manifest = read_json(location, work_folder, MANIFEST, deadline)
     if manifest is None:
-        return ValueError(f"{location}: not a store: has neither zarr.json nor .zattrs")
+        reason = refused(file_url(root, "zarr.json")) if isinstance(root, str) else ""
+        return ValueError(
+            f"{location}: not a store: has neither zarr.json nor .zattrs"
+            + (f" ({reason})" if reason else "")
+        )
     done = (read_key(location, work_folder, JOURNAL, deadline) or b"").count(b"\n")
     return ValueError(
         f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
         f"{RESUME_ADVICE}"
     )
+
+
+def _parse_group(
+    location: str, attributes: dict[str, Any], image: str | None
+) -> tuple[MultiscaleImage | None, StoreLayout | None]:
+    """Returns the image that `_parse_image` finds, and the layout of the group, if it has one."""
+    store_json = attributes.get("gvtorch")
+    layout = None if store_json is None else StoreLayout.parse(location, store_json)
+    return _parse_image(location, attributes, image), layout
 
 
 def _parse_image(
@@ -195,14 +205,10 @@ def _parse_image(
 
 def _image_names(attributes: dict[str, Any]) -> list[str]:
     """Returns the names under which `find_image` finds the images that a group lists."""
-    images, folders = _ngff_attribute(attributes, "multiscales"), attributes.get(CHANNELS_ATTRIBUTE)
-    multiscales, folder_names = (
-        listed if isinstance(listed, list) else [] for listed in (images, folders)
-    )
-    names = [
-        str(item.get("name", n)) for n, item in enumerate(multiscales) if isinstance(item, dict)
-    ]
-    return [*names, *(name for name in folder_names if isinstance(name, str))]
+    listed = _ngff_attribute(attributes, "multiscales"), attributes.get(CHANNELS_ATTRIBUTE)
+    images, folders = (items if isinstance(items, list) else [] for items in listed)
+    names = [str(item.get("name", n)) for n, item in enumerate(images) if isinstance(item, dict)]
+    return [*names, *(name for name in folders if isinstance(name, str))]
 
 
 def _join_some(names: list[str]) -> str:
@@ -222,17 +228,23 @@ def _note_other_images(image: MultiscaleImage, others: list[str]) -> None:
         image.dropped.append(f"the images {_join_some(others)} {hint}")
 
 
-def _other_images(location: str, root: Any, deadline: Deadline, opened: str) -> list[str]:
-    """Returns the names of the other images of a bioformats2raw layout."""
+def _image_folders(
+    location: str, root: Any, attributes: dict[str, Any], deadline: Deadline
+) -> list[str]:
+    """Returns the folders of the images in a group: the channels of a store of several, or the
+    series that OME lists, else "0", and "1" if there is such an image (bioformats2raw's layout).
+    """
+    folders = attributes.get(CHANNELS_ATTRIBUTE)
     try:
-        attributes = _attributes(f"{location}/OME", child(root, "OME"), deadline) or {}
-        series = _ngff_attribute(attributes, "series")
-        if isinstance(series, list):
-            return [str(path) for path in series if path != opened]
-        has_second = _attributes(f"{location}/1", child(root, "1"), deadline) is not None
+        if folders is None:
+            ome = _attributes(f"{location}/OME", child(root, "OME"), deadline)
+            folders = _ngff_attribute(ome or {}, "series")
+        if not isinstance(folders, list):
+            has_second = _attributes(f"{location}/1", child(root, "1"), deadline) is not None
+            folders = ["0", "1"] if has_second else ["0"]
     except (OSError, ValueError):  # damage there must not prevent opening the image
-        return []
-    return ["1"] if has_second else []
+        return ["0"]
+    return [folder for folder in folders if isinstance(folder, str)] or ["0"]
 
 
 def _label_notes(location: str, root: Any, deadline: Deadline) -> list[str]:
@@ -266,11 +278,11 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
     if not isinstance(datasets, list) or not 1 <= len(datasets) <= _MAX_LEVELS:
         raise ValueError(f"{location}: multiscales must have 1 to {_MAX_LEVELS} datasets")
     outer = _parse_transforms(location, item.get("coordinateTransformations"), axes, dropped)
-    scales, times = [], []
+    factors, scales, times = _unit_factors(units, dropped), [], []
     for dataset in datasets:
-        path = dataset.get("path") if isinstance(dataset, dict) else None
-        is_printable = isinstance(path, str) and path.isprintable() and ".." not in path
-        if not isinstance(path, str) or not is_printable or not path or path.startswith("/"):
+        path: Any = dataset.get("path") if isinstance(dataset, dict) else None
+        is_inside = isinstance(path, str) and path and path.isprintable() and path[0] != "/"
+        if not is_inside or ".." in path:
             raise ValueError(
                 f"{location}: a dataset needs a path inside the store, got {brief(path)}"
             )
@@ -279,16 +291,16 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
         )
         time_scale, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
         time_offset, *offsets = (m * s + o for m, s, o in zip(translation, *outer, strict=True))
-        factors = _unit_factors(units, dropped)
         spacing, position = (
-            [a * f for a, f in zip(lengths, factors, strict=True)] for lengths in (zyx, offsets)
+            tuple(a * f for a, f in zip(lengths, factors, strict=True))
+            for lengths in (zyx, offsets)
         )
-        scales.append(ImageArray(path.strip("/"), _triple(spacing), _triple(position)))
+        scales.append(ImageArray(path.strip("/"), spacing, position))
         times.append((time_scale, time_offset))
     name = item.get("name")
     channels, damaged = _read_channels(omero) if omero is not None else ((), [])
     (step, origin), step_unit = times[0], units.get("t")
-    has_time_step = "t" in axes and (step_unit is not None or step != 1)
+    has_time_step = "t" in axes and step > 0 and (step_unit is not None or step != 1)
     info = ImageInfo(
         unit=units.get("x"),
         channels=channels,
@@ -302,24 +314,17 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
     )
 
 
-def _triple(values: Sequence[float]) -> tuple[float, float, float]:
-    z, y, x = values
-    return (z, y, x)
-
-
 def _unit_factors(units: dict[str, str], dropped: list[str]) -> list[float]:
     """Returns factors along z, y, x that convert lengths to the unit of x."""
     x_unit, factors = units.get("x"), []
     for axis in "zyx":
         unit = units.get(axis)
-        metres_per_unit, metres_per_x = metres(unit), metres(x_unit)
-        factors.append(
-            float(f"{metres_per_unit / metres_per_x:.12g}")
-            if metres_per_unit and metres_per_x
-            else 1.0
-        )
-        if not (metres_per_unit and metres_per_x) and unit is not None and unit != x_unit:
+        metres_per_unit, metres_per_x, factor = metres(unit), metres(x_unit), 1.0
+        if metres_per_unit and metres_per_x:
+            factor = float(f"{metres_per_unit / metres_per_x:.12g}")
+        elif unit is not None and unit != x_unit:
             dropped.append(f"unit {brief(unit)} of {axis}, where that of x is {x_unit!r}")
+        factors.append(factor)
     return factors
 
 
@@ -395,24 +400,17 @@ def image_metadata(
         pairs = list(zip(layout.axes, factors, strict=True))
         scale = [steps[axis] * factor for axis, factor in pairs]
         translation = [origins[axis] + (factor - 1) / 2 * steps[axis] for axis, factor in pairs]
-        transforms = [
-            {"type": "scale", "scale": scale},
-            {"type": "translation", "translation": translation},
-        ]
-        datasets.append({"path": str(level), "coordinateTransformations": transforms})
+        transforms = {"scale": scale, "translation": translation}
+        listed = [{"type": kind, kind: numbers} for kind, numbers in transforms.items()]
+        datasets.append({"path": str(level), "coordinateTransformations": listed})
     method = "mode" if info.labels else "mean"  # how coarse levels are made
     ome: dict[str, Any] = {
         "version": "0.5",
         "multiscales": [{"name": name, "type": method, "axes": axes, "datasets": datasets}],
     }
-    extras: dict[str, Any] = {
-        "quantity": info.quantity,
-        "space": info.space,
-        "labels": info.labels or None,
-    }
+    extras: dict[str, Any] = {"quantity": info.quantity, "space": info.space, "labels": info.labels}
     if info.channels:
-        ome["omero"], assumed = _write_channels(info.channels, layout.value_range or ())
-        extras["assumed"] = assumed or None
+        ome["omero"], extras["assumed"] = _write_channels(info.channels, layout.value_range or ())
     return ome, {key: value for key, value in extras.items() if value}
 
 
@@ -468,15 +466,12 @@ def _write_channels(
 def _forget_assumed(channels: Sequence[ChannelInfo], assumed: Any) -> tuple[ChannelInfo, ...]:
     """Returns the channels without the colours and windows that `_write_channels` made up."""
     fields = assumed if isinstance(assumed, dict) else {}
-    assumed_numbers = {
-        name: fields[name] for name in ("color", "window") if isinstance(fields.get(name), list)
-    }
-    cleaned = []
-    for number, channel in enumerate(channels):
-        cleared: dict[str, Any] = {
-            name: None for name, numbers in assumed_numbers.items() if number in numbers
-        }
-        cleaned.append(replace(channel, **cleared))
+    cleaned = list(channels)
+    for name in ("color", "window"):
+        for number in fields[name] if isinstance(fields.get(name), list) else ():
+            if number in range(len(cleaned)):
+                cleared: dict[str, Any] = {name: None}
+                cleaned[number] = replace(cleaned[number], **cleared)
     return tuple(cleaned)
 
 
@@ -489,10 +484,7 @@ def _parse_color(text: Any) -> Rgb | None:
 def _parse_window(window: Any) -> tuple[float, float] | None:
     if not isinstance(window, dict):
         return None
-    bounds: list[Any] = [
-        window.get("start", window.get("min")),
-        window.get("end", window.get("max")),
-    ]
-    if not all(map(is_number, bounds)) or bounds[0] > bounds[1]:
-        return None
-    return (float(bounds[0]), float(bounds[1]))
+    low: Any = window.get("start", window.get("min"))
+    high: Any = window.get("end", window.get("max"))
+    is_valid = is_number(low) and is_number(high) and low <= high
+    return (float(low), float(high)) if is_valid else None

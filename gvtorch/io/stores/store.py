@@ -17,12 +17,11 @@ import torch
 
 from ...base import boxes, check
 from ...base.boxes import Zyx
-from ...base.labels import background, counted
-from ...pool.downsample import pool_majority, pool_mean
+from ...base.labels import counted
 from .block_reader import BlockReader, cut_blocks, wait_for_array
 from .checksums import json_checksum
 from .chunk_files import begin_read
-from .level_reader import LevelReader, Pool, keep_channels, open_arrays
+from .level_reader import LevelReader, keep_channels, open_arrays, pool_of
 from .ngff import find_image, read_json
 from .store_layout import BORDER, CELL, DTYPES, CoarseChannel, StoreLayout, value_dtype
 from .tensorstores import Deadline, begin_open, child, kvstore
@@ -94,9 +93,7 @@ class Store:
             None if layout.label_count is None else _read_labels(context, root, layout, deadline)
         )
         self.label_values = None if label_values is None else torch.from_numpy(label_values)
-        self.pool: Pool = pool_mean
-        if pyramid.info.labels:
-            self.pool = partial(pool_majority, background=background(label_values))
+        self.pool = pool_of(pyramid.info, label_values)
         self._levels = LevelReader(arrays, layout, self.pool)
         keep_channels(pyramid, sizes, channel_index)
         self.location, self.root = context, kvstore(context)
@@ -297,12 +294,7 @@ class Store:
             ValueError: A block lies outside the grid.
             TimeoutError: Reading all of them took longer.
         """
-        zyx = np.asarray(zyx, np.int64).reshape(-1, 3)
-        grid = self.block_grid(level)
-        if zyx.size and (zyx.min() < 0 or (zyx >= grid).any()):
-            raise ValueError(
-                f"read_blocks: a position lies outside the grid {grid} of level {level}"
-            )
+        zyx = self._checked_positions("read_blocks", level, zyx)
         deadline = Deadline(timeout)
         if self._blocks is None:
             return cut_blocks(self._levels, self.location, level, zyx, self.layout, deadline)
@@ -320,15 +312,20 @@ class Store:
             KeyError: There is no such channel.
             ValueError, TimeoutError: As `read_blocks`.
         """
-        channel, grid = self.coarse[name], self.block_grid(level)
-        if level == 0 or (zyx.size and (zyx.min() < 0 or (zyx >= grid).any())):
-            raise ValueError(
-                f"read_coarse: a position lies outside the grid {grid} of level {level}"
-            )
+        channel = self.coarse[name]
+        zyx = self._checked_positions("read_coarse", level, zyx, finest=1)
         assert self._blocks is not None  # only stores with blocks have coarse channels
         folder = f"{self.coarse_folder}/{channel.folder(name)}"
         spec = self.layout.coarse(level, folder, channel.width)
         return self._blocks.read_coarse(spec, level, zyx, Deadline(timeout))
+
+    def _checked_positions(
+        self, caller: str, level: int, zyx: np.ndarray, finest: int = 0
+    ) -> np.ndarray:
+        zyx, grid = np.asarray(zyx, np.int64).reshape(-1, 3), self.block_grid(level)
+        if level < finest or (zyx.size and (zyx.min() < 0 or (zyx >= grid).any())):
+            raise ValueError(f"{caller}: a position lies outside the grid {grid} of level {level}")
+        return zyx
 
     def _checked_level(self, level: int) -> int:
         return check.integer(self.location, "level", level, low=0, high=self.levels - 1)

@@ -142,24 +142,15 @@ class StoreLayout:
 
     def blocks(self, level: int) -> dict[str, Any]:
         """Spec of the array of bordered blocks of a level."""
-        item_shape = [self.bordered_side] * 3 + [self.width]
-        return self._array(
-            f"gvtorch/blocks/{level}",
-            shape=[*self.grid(level, self.block), *item_shape],
-            shard=[*[self.shard // self.block] * 3, *item_shape],
-            chunk=[1, 1, 1, *item_shape],
-            write_zeros=False,
-            times=self.times,
+        path, item_shape = f"gvtorch/blocks/{level}", [self.bordered_side] * 3 + [self.width]
+        return self._grid_array(
+            path, level, self.block, self.shard, item_shape, write_zeros=False, times=self.times
         )
 
     def cells(self, level: int) -> dict[str, Any]:
         """Spec of the array of low, high, mean of a level."""
-        item_shape = [3, self.width]
-        return self._array(
-            f"gvtorch/cells/{level}",
-            shape=[*self.grid(level, CELL), *item_shape],
-            shard=[*[self.shard // CELL] * 3, *item_shape],
-            chunk=[*[_CELL_CHUNK] * 3, *item_shape],
+        return self._grid_array(
+            *(f"gvtorch/cells/{level}", level, CELL, self.shard, [3, self.width], _CELL_CHUNK),
             times=self.times,
         )
 
@@ -172,11 +163,8 @@ class StoreLayout:
         is the channel's.
         """
         item_shape = [self.bordered_side] * 3 + [width]
-        return dataclasses.replace(self, dtype="float16")._array(
-            f"{folder}/{level}",
-            shape=[*self.grid(level, self.block), *item_shape],
-            shard=[*[_COARSE_SHARD // self.block] * 3, *item_shape],
-            chunk=[1, 1, 1, *item_shape],
+        return dataclasses.replace(self, dtype="float16")._grid_array(
+            f"{folder}/{level}", level, self.block, _COARSE_SHARD, item_shape
         )
 
     def labels(self) -> dict[str, Any]:
@@ -194,6 +182,27 @@ class StoreLayout:
         needed = 0 < level < self.levels - 1
         paths = [f"{WORK}/{bound}/{level}" for bound in ("low", "high")]
         return [self.pyramid(level, path=path) for path in paths] if needed else []
+
+    def _grid_array(
+        self,
+        path: str,
+        level: int,
+        side: int,
+        shard_side: int,
+        item_shape: list[int],
+        chunk_items: int = 1,
+        **options: Any,
+    ) -> dict[str, Any]:
+        """Spec of an array of items of `item_shape`, one for each cube of `side` voxels of a level;
+        `chunk_items` are the items along a side of a chunk.
+        """
+        return self._array(
+            path,
+            shape=[*self.grid(level, side), *item_shape],
+            shard=[shard_side // side] * 3 + item_shape,
+            chunk=[chunk_items] * 3 + item_shape,
+            **options,
+        )
 
     def _array(
         self,
@@ -241,13 +250,11 @@ class StoreLayout:
 
     def attributes(self, placement: dict[str, Any]) -> dict[str, Any]:
         """Returns the metadata of a complete store; `placement` is its spacing and origin."""
-        time_fields = {"times": self.times} if self.times > 1 else {}
-        label_fields = {"label_count": self.label_count} if self.label_count is not None else {}
         return {
             "version": VERSION + (self.times > 1),
             "extent": list(self.extent),
-            **time_fields,
-            **label_fields,
+            **({"times": self.times} if self.times > 1 else {}),
+            **({} if self.label_count is None else {"label_count": self.label_count}),
             **placement,
             "dtype": self.dtype,
             "channels": self.width,
@@ -268,31 +275,30 @@ class StoreLayout:
             raise ValueError(
                 f"{location}: half-written or damaged: zarr.json does not say complete"
             )
-        if attributes.get("version") not in (VERSION, VERSION + 1):
+        if (version := attributes.get("version")) not in (VERSION, VERSION + 1):
             raise ValueError(
-                f"{location}: store version {brief(attributes.get('version'))}, this reads "
+                f"{location}: store version {brief(version)}, this reads "
                 f"{VERSION} and {VERSION + 1}"
             )
-        times, count = attributes.get("times", 1), attributes.get("label_count")
-        extent: Any = attributes.get("extent")
-        ranges: Any = attributes.get("value_range")
-        checks = {
+        optional = dict.fromkeys(("label_count", "files_sum", "threshold"))
+        given: dict[str, Any] = {"times": 1, **optional, **attributes}
+        extent: Any = given.get("extent")
+        ranges: Any = given.get("value_range")
+        checks: dict[str, Any] = {
             "extent": _is_list(extent, 3)
             and all(_is_whole(n, 1, MAX_STORE_VOXELS) for n in extent),
-            "times": _is_whole(
-                times, attributes["version"], MAX_TIMES if attributes["version"] > 1 else 1
-            ),
-            "dtype": attributes.get("dtype") in list(DTYPES),
-            "label_count": count is None or _is_whole(count, 1, 2**24),
-            "files_sum": attributes.get("files_sum") is None
-            or _is_whole(attributes["files_sum"], 0, 2**32 - 1),
-            "channels": _is_whole(attributes.get("channels"), 1, 2**16),
-            "block": attributes.get("block") in BLOCKS,
-            "border": attributes.get("border") == BORDER,
-            "cell": attributes.get("cell") == CELL,
-            "branching": attributes.get("branching") == 2,
-            "threshold": attributes.get("threshold") is None or is_number(attributes["threshold"]),
-            "value_range": _is_list(ranges, attributes.get("channels"))
+            "times": _is_whole(given["times"], *((2, MAX_TIMES) if version > 1 else (1, 1))),
+            "dtype": given.get("dtype") in list(DTYPES),
+            "label_count": given["label_count"] is None
+            or _is_whole(given["label_count"], 1, 2**24),
+            "files_sum": given["files_sum"] is None or _is_whole(given["files_sum"], 0, 2**32 - 1),
+            "channels": _is_whole(given.get("channels"), 1, 2**16),
+            "block": given.get("block") in BLOCKS,
+            "border": given.get("border") == BORDER,
+            "cell": given.get("cell") == CELL,
+            "branching": given.get("branching") == 2,
+            "threshold": given["threshold"] is None or is_number(given["threshold"]),
+            "value_range": _is_list(ranges, given.get("channels"))
             and all(_is_list(pair, 2) for pair in ranges)
             and all(is_number(low) and is_number(high) and low <= high for low, high in ranges),
         }
@@ -301,14 +307,9 @@ class StoreLayout:
                 raise ValueError(
                     f"{location}: damaged: gvtorch.{key} is {brief(attributes.get(key))}"
                 )
-        fields = {key: attributes[key] for key in ("dtype", "block", "value_range")}
-        fields |= {"times": times, "label_count": count, "files_sum": attributes.get("files_sum")}
-        return cls(
-            extent=tuple(extent),
-            width=attributes["channels"],
-            threshold=attributes.get("threshold"),
-            **fields,
-        )
+        copied = ("dtype", "block", "value_range", "times", "label_count", "files_sum", "threshold")
+        fields = {key: given[key] for key in copied}
+        return cls(extent=tuple(given["extent"]), width=given["channels"], **fields)
 
 
 @dataclass(frozen=True, kw_only=True)

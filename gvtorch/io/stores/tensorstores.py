@@ -11,7 +11,7 @@ from typing import Any
 
 from ...base.whole_file import text_path
 from ..http import Endless, file_url, is_http, read_http
-from ..relay import read_within, relay_folder, with_urls
+from ..relay import range_bytes, read_within, relay_folder, with_urls
 from ..remote import local_path
 from ..resources import cores
 from .store_layout import WRITE_ZEROS
@@ -123,47 +123,28 @@ def read_key(
     """
     import tensorstore as ts
 
-    if isinstance(root, dict):
-        from .chunk_files import check_file
+    file = f"{location}/{name}"
+    try:
+        if is_http(root):
+            size = max_bytes if byte_range is None else range_bytes(byte_range, max_bytes)
+            limits: Any = {"max_file_bytes": max_bytes, "seconds": deadline.left}
+            return read_http(file_url(root, name), min(size, max_bytes), byte_range, **limits)
+        if isinstance(root, dict):
+            from .chunk_files import check_file
 
-        try:
             check_file(f"{root['path']}{name}", max_bytes)
-        except Endless as error:
-            raise StoreError(f"{location}/{name}: {error}") from None
-    if is_http(root):
-        url, size = file_url(root, name), max_bytes
-        if byte_range is not None:
-            size = (
-                byte_range.stop - (byte_range.start or 0)
-                if byte_range.stop is not None
-                else -byte_range.start
-            )
         try:
-            return read_http(
-                url,
-                min(size, max_bytes),
-                byte_range,
-                max_file_bytes=max_bytes,
-                seconds=deadline.left,
-            )
-        except TimeoutError:
-            raise deadline.timeout_error(f"{location}/{name}") from None
-        except OSError as error:
-            raise StoreError(f"{location}/{name}: {one_line_error(error)}") from None
-    try:
-        folder = deadline.wait(ts.KvStore.open(root, context=context()), location)
-    except StoreError as error:
-        raise ValueError(f"{location}: not a store: {error}") from None
-    try:
-        return read_within(
-            folder,
-            name,
-            byte_range,
-            max_bytes,
-            lambda future: deadline.wait(future, f"{location}/{name}"),
-        )
-    except Endless as error:
-        raise StoreError(f"{location}/{name}: {error}") from None
+            folder = deadline.wait(ts.KvStore.open(root, context=context()), location)
+        except StoreError as error:
+            raise ValueError(f"{location}: not a store: {error}") from None
+        wait = functools.partial(deadline.wait, context=file)
+        return read_within(folder, name, byte_range, max_bytes, wait)
+    except StoreError:
+        raise
+    except TimeoutError:
+        raise deadline.timeout_error(file) from None
+    except OSError as error:
+        raise StoreError(f"{file}: {one_line_error(error)}") from None
 
 
 def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
@@ -187,11 +168,11 @@ def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any
     if relayed is None:
         from .chunk_files import METADATA_FILES, check_file, failed_future
 
-        for name in METADATA_FILES:
-            try:
-                check_file(f"{folder['path']}{name}", MAX_JSON_BYTES)
-            except Endless as error:
-                return failed_future(Endless(f"{name}: {error}"))
+        try:
+            for name in METADATA_FILES:
+                check_file(f"{folder['path']}{name}", MAX_JSON_BYTES, name)
+        except Endless as error:
+            return failed_future(error)
     array_spec = {**spec, "kvstore": relayed.spec if relayed else folder}
     future = ts.open(array_spec, context=context(), open=True, create=create)
     if relayed:

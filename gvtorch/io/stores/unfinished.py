@@ -67,6 +67,15 @@ class UnfinishedStore:
         write_json(self.target / "zarr.json", group_metadata(attributes))
         shutil.rmtree(self.target / WORK, ignore_errors=True)
 
+    def discard(self) -> None:
+        """Removes everything from the target, which may be a link, except the lock."""
+        for folder in (self.target, self.target / WORK):
+            for entry in folder.iterdir():
+                if entry.is_dir() and entry.name != WORK:
+                    shutil.rmtree(entry, ignore_errors=True)
+                elif entry.name not in (WORK, _LOCK):
+                    entry.unlink()
+
 
 def is_finished(target: Path) -> bool:
     """Returns whether there is a finished store."""
@@ -116,7 +125,7 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
         ValueError: Settings or source differ from those of the store to resume.
     """
     folder = target / WORK
-    with _claimed_folder(target):
+    with claimed_folder(target):
         begun = is_begun(target, resume=resume)
         done = {}
         if begun:
@@ -133,7 +142,7 @@ def claimed(target: Path, settings: dict[str, Any], *, resume: bool) -> Iterator
 
 
 @contextmanager
-def _claimed_folder(target: Path) -> Iterator[None]:
+def claimed_folder(target: Path) -> Iterator[None]:
     """Holds the lock of a target. At the end, removes the work folder if it is empty, and then the
     target if this created it. If another process removes folder and lock meanwhile, tries again.
     """
@@ -244,8 +253,10 @@ def checksum(arrays: Iterable[np.ndarray]) -> int:
     return total
 
 
-def fingerprint(source: str | Path | Volume) -> list[Any]:
-    """Returns a source's sizes and modification times, or a checksum: equal while unchanged."""
+def fingerprint(source: str | Path | Volume, target: Path | None = None) -> list[Any]:
+    """Returns a source's sizes and modification times, or a checksum: equal while unchanged.
+    `target`, a store that may lie in a source's folder, does not count.
+    """
     if isinstance(source, Volume):
         data = movable(source.data).cpu().numpy()
         return [list(data.shape), str(source.data.dtype), checksum([data])]
@@ -257,9 +268,14 @@ def fingerprint(source: str | Path | Volume) -> list[Any]:
         stat = path.stat()
         return [stat.st_size, stat.st_mtime_ns]
     digest, file_count = hashlib.sha256(), 0
-    for file in sorted(path.iterdir()):
-        stat = file.stat()
-        size = stat.st_size if file.is_file() else 0
-        digest.update(f"{file.name} {size} {stat.st_mtime_ns}\n".encode())
-        file_count += 1
+    skipped = None if target is None else os.path.realpath(target)
+    for folder, folders, names in os.walk(path):
+        folders[:] = sorted(
+            name for name in folders if os.path.realpath(os.path.join(folder, name)) != skipped
+        )
+        for file in sorted(os.path.join(folder, name) for name in names):
+            stat = os.stat(file, follow_symlinks=os.path.exists(file))
+            line = f"{os.path.relpath(file, path)} {stat.st_size} {stat.st_mtime_ns}\n"
+            digest.update(os.fsencode(line))
+            file_count += 1
     return [file_count, digest.hexdigest()]
