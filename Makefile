@@ -51,8 +51,9 @@ gallery: $(VENV)/ready
 # glibc would hand each large tensor's memory back to the system, and the next one would wait for it to be cleared: kept,
 # the tests take a seventh less time.
 KEEP := MALLOC_MMAP_THRESHOLD_=1000000000 MALLOC_TRIM_THRESHOLD_=4000000000
-# Tests wait for browsers and for processes of their own: one more at a time than there are cores, but at most 4.
-WORKERS := $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 4 ? n + 1 : 4)))
+# Tests wait for browsers, servers and processes of their own (with three at a time, two cores were idle for a sixth of the
+# time): two more at a time than there are cores, but at most 4.
+WORKERS := $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 2 ? 3 : 4)))
 test: $(VENV)/ready
 	OMP_NUM_THREADS=1 $(KEEP) GVTORCH_REQUIRE=$(REQUIRE) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal \
 	  --durations 20 --durations-min 5 $(ARGS)

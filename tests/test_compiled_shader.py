@@ -11,13 +11,15 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from helpers import DEVICES, TESTS
+from helpers import DEVICES
 from helpers.compiled import ADD, HEADER, only_included, quick_compiler, users_shader, write_header
+from helpers.packets import result, start
 from helpers.pictures import assert_close_picture
 from helpers.rays import camera_rays, world_rays
 from helpers.shaders import POINT
@@ -25,7 +27,7 @@ from helpers.traces import SHADER, op_arguments, trace
 from helpers.trees import copy_to, with_holes
 
 import gvtorch as gv
-from gvtorch.cpp_ext import compilers, user
+from gvtorch.cpp_ext import compilers, instructions, user
 
 BANDS = {"density": 0.4, "width": 3.0, "fade": 0.005}
 CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
@@ -268,19 +270,18 @@ def red(shader: gv.CompiledShader) -> float:
     return float(gv.render(tree, gv.Camera.orbit(width=1, height=1), shader).color[0, 0, 0])
 
 
-def in_processes(
-    count: int, given: Path, make: str = "gv.CompiledShader(given, 'Own')"
-) -> list[str]:
-    """Loads `Own` of a header in several processes at once; returns the red that each draws."""
-    code = (
-        f"import pickle, sys; sys.path.insert(0, {str(TESTS)!r})\n"
-        "import gvtorch as gv\n"
-        "from test_compiled_shader import red\n"
-        f"given = sys.argv[1]; print(red({make}))\n"
-    )
-    call = [sys.executable, "-c", code, str(given)]
-    runs = [subprocess.Popen(call, stdout=subprocess.PIPE, text=True) for _ in range(count)]
-    return [run.communicate(timeout=300)[0].strip() for run in runs]
+def red_of_given() -> float:
+    """Returns the red that `Own` draws, of the header or the pickle that the environment names."""
+    given = Path(os.environ["GIVEN"])
+    pickled = given.suffix == ".pkl"
+    return red(pickle.loads(given.read_bytes()) if pickled else gv.CompiledShader(given, "Own"))
+
+
+def in_processes(folder: Path, count: int, given: Path) -> list[float]:
+    """Returns what `red_of_given` returns in several processes at once."""
+    folders = [Path(tempfile.mkdtemp(dir=folder)) for _ in range(count)]
+    runs = [start(red_of_given, one, instructions(), GIVEN=str(given)) for one in folders]
+    return [result(run) for run in runs]
 
 
 @pytest.mark.backend("cpp")
@@ -297,7 +298,7 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
     environment = {"GVTORCH_CACHE": str(tmp_path / "cache"), "CXX": compiler}
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert in_processes(2, header) == ["0.25", "0.25"]
+    assert in_processes(tmp_path, 2, header) == [0.25, 0.25]
     calls = count.read_text()
     assert 1 <= calls.count("call") <= 2
     first = built(tmp_path / "cache")
@@ -583,7 +584,7 @@ def test_it_is_unpickled_in_another_process(tmp_path):
     shader = gv.CompiledShader(write_header(tmp_path, ADD.replace("COLOR", "0.5")), "Own")
     kept, tracer = tmp_path / "shader.pkl", tmp_path / "tracer.pkl"
     kept.write_bytes(pickle.dumps(shader))
-    assert in_processes(1, kept, make="pickle.load(open(given, 'rb'))") == ["0.5"]
+    assert in_processes(tmp_path, 1, kept) == [0.5]
     tree = gv.N3Tree.from_volume(gv.Volume(torch.ones(8, 8, 8)), 8)
     unknown = "x" * len(shader.op)  # a name that no library here has
     pickled = pickle.dumps(gv.TreeTracer(tree, shader))

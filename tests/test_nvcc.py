@@ -19,9 +19,16 @@ ARCHS = ("90",)
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch) -> Path:
-    """A separate cache, and an nvcc that does not optimise."""
+    """A separate cache, and an nvcc that does not optimise. If there is a file `scan`, it removes
+    that and only lists what is included, beside an empty library.
+    """
     nvcc = tmp_path / "nvcc"
-    nvcc.write_text(f'#!/bin/sh\nexec {compilers.find_nvcc()} "$@" -O0 -Xptxas=-O0\n')
+    change = 'case "$a" in -MD) a=-M;; shader.so) a=shader.d;; esac'
+    scan = f'touch shader.so; for a; do shift; {change}; set -- "$@" "$a"; done'
+    nvcc.write_text(
+        f'#!/bin/sh\nif rm "{tmp_path}/scan" 2>&-; then {scan}; fi\n'
+        f'exec {compilers.find_nvcc()} "$@" -O0 -Xptxas=-O0\n'
+    )
     nvcc.chmod(0o755)
     monkeypatch.setenv("NVCC", str(nvcc))
     monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path / "cache"))
@@ -39,7 +46,9 @@ def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, c
     header.write_text(f"{branches}constexpr float kColor = 0.25f;\n#endif\n" + header.read_text())
     monkeypatch.chdir(tmp_path)
     before = user.ShaderSource.read(header, "Own")
+    (tmp_path / "scan").touch()  # the first library goes, because it lists a file not known before
     library = user.compiled(before, ARCHS)
+    assert not (tmp_path / "scan").exists()
     after = user.ShaderSource.read(header, "Own")
     assert library.parent == cache and b"Own_" in library.read_bytes()
     assert json.loads(after.list_path.read_text()) == [str(part)]

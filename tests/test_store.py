@@ -20,6 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gvtorch as gv
+from gvtorch.base.boxes import repeat_edges
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.level_reader import StoreError
 from gvtorch.io.stores.store import Store
@@ -55,6 +56,19 @@ def test_a_store_has_the_bits_of_the_pyramid(
     low, high = data.min((0, 1, 2)), data.max((0, 1, 2))
     assert store.value_range == list(zip(low.tolist(), high.tolist(), strict=True))
     assert_holds(store, data)
+
+
+def test_voxels_beyond_a_grid_are_those_of_its_edge():
+    """Of boxes that reach beyond a grid, lie inside it, or miss it."""
+    pick = np.random.default_rng(1)
+    for _ in range(300):
+        low, shape, start = pick.integers(-9, 9, 3), pick.integers(1, 6, 3), pick.integers(-3, 4, 3)
+        high, data = low + pick.integers(1, 9, 3), noise((*shape, 2))
+        index = [
+            np.arange(a, b).clip(0, n - 1)
+            for a, b, n in zip(low - start, high - start, shape, strict=True)
+        ]
+        assert np.array_equal(repeat_edges(data, start, low, high), data[np.ix_(*index)])
 
 
 @pytest.fixture(scope="module")

@@ -341,8 +341,8 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
         low = np.maximum(center - radius - 1, 0).astype(int)
         high = np.minimum(center + radius + 2, 1024).astype(int)
         box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        axes = np.ogrid[box]
-        distance = sum((a - c) ** 2 for a, c in zip(axes, center, strict=True)) ** 0.5
+        axes = zip(np.ogrid[box], center, strict=True)
+        distance = sum(((a - c) ** 2).astype(np.float32) for a, c in axes) ** 0.5
         ball = (np.clip(radius - distance, 0, 8) * 25).astype(np.uint8)
         raw[box] = np.maximum(raw[box], ball)
     raw.flush()

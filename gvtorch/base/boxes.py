@@ -35,11 +35,23 @@ def clamped_box(low: Zyx, high: Zyx, shape: Zyx) -> tuple[list[int], list[int]]:
 
 def repeat_edges(data: np.ndarray, start: Zyx, low: Zyx, high: Zyx) -> np.ndarray:
     """Returns (z, y, x, c) voxels that begin at `start`, extended to a box by edge voxels."""
-    for axis, (first, a, b) in enumerate(zip(start, low, high, strict=True)):
-        size = data.shape[axis]
-        if (first, first + size) != (a, b):
-            data = data.take(np.arange(a - first, b - first).clip(0, size - 1), axis)
-    return data
+    shape = [b - a for a, b in zip(low, high, strict=True)]
+    if list(data.shape[:3]) == shape and list(start) == list(low):
+        return data
+    used: list[slice] = []  # of the voxels
+    filled: list[slice] = []  # of the box, with these voxels
+    for first, a, size, count in zip(start, low, data.shape, shape, strict=False):
+        begin, before = min(max(a - first, 0), size - 1), min(max(first - a, 0), count - 1)
+        width = max(min(size - begin, count - before), 1)
+        used.append(slice(begin, begin + width))
+        filled.append(slice(before, before + width))
+    out = np.empty((*shape, *data.shape[3:]), data.dtype)
+    out[tuple(filled)] = data[tuple(used)]
+    for axis, inside in enumerate(filled):
+        planes = np.moveaxis(out, axis, 0)
+        planes[: inside.start] = planes[inside.start]
+        planes[inside.stop :] = planes[inside.stop - 1]
+    return out
 
 
 def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -132,6 +133,13 @@ class LabelNumbers(NamedTuple):
 
 
 _Record = TypeVar("_Record")
+
+
+@cache
+def _parameter_count(record: Callable[..., Any]) -> int:
+    return len(inspect.signature(record).parameters)
+
+
 #: How many numbers each field of `ShadeParameters` takes, in order.
 _WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 1, 1)
 
@@ -163,8 +171,7 @@ class ShadeParameters(NamedTuple):
 
     def own_as(self, record: Callable[..., _Record]) -> _Record:
         """Returns the shader-specific numbers by name, as one of the records above."""
-        count = len(inspect.signature(record).parameters)
-        return record(*self.own[:count])
+        return record(*self.own[: _parameter_count(record)])
 
     @classmethod
     def read(cls, parameter_54: Tensor) -> ShadeParameters:

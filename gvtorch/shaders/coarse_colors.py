@@ -242,12 +242,19 @@ def _upsampled(values: Tensor, slope_axis: int | None = None) -> Tensor:
 def _refine_axis(
     center: Tensor, before: Tensor, behind: Tensor, axis: int, slope_axis: int | None
 ) -> Tensor:
+    shape = list(center.shape)
+    shape.insert(axis + 1, 2)
+    halves = center.new_empty(shape)
+    first, second = halves.unbind(axis + 1)
     if axis == slope_axis:
         rise, fall = behind - center, center - before
-        halves = (0.25 * rise + 0.75 * fall, 0.75 * rise + 0.25 * fall)
+        torch.add(0.25 * rise, 0.75 * fall, out=first)
+        torch.add(0.75 * rise, 0.25 * fall, out=second)
     else:
-        halves = (0.75 * center + 0.25 * before, 0.75 * center + 0.25 * behind)
-    return torch.stack(halves, axis + 1).flatten(axis, axis + 1)
+        middle = 0.75 * center
+        torch.add(middle, 0.25 * before, out=first)
+        torch.add(middle, 0.25 * behind, out=second)
+    return halves.flatten(axis, axis + 1)
 
 
 @dataclass(frozen=True)
@@ -292,18 +299,21 @@ class _Columns:
             front_light, back_light = front_light.cumprod(0), back_light.flip(0).cumprod(0).flip(0)
         front_light, back_light = front_light + _MIN_LIGHT, back_light + _MIN_LIGHT
         alpha = 1 - self.clear
-        sides = [
-            [color[:3] * light, (alpha * light)[None], light[None]]
-            for color, light in ((self.front, front_light), (self.back, back_light))
-        ]
-        if len(self.front) > 3:
-            sides[0].insert(2, _weighted_moments(self.front, alpha, front_light, 1))
-            sides[1].insert(2, _weighted_moments(self.back, alpha, back_light, -1))
-        return torch.stack([torch.cat(side) for side in sides])
+        weighted = self.front.new_empty((2, len(self.front) + 2, *alpha.shape))
+        sides = ((self.front, front_light, 1), (self.back, back_light, -1))
+        for out, (color, light, direction) in zip(weighted, sides, strict=True):
+            torch.mul(color[:3], light, out=out[:3])
+            torch.mul(alpha, light, out=out[3])
+            if len(color) > 3:
+                _weigh_moments(color, alpha, light, direction, out[4:-1])
+            out[-1] = light
+        return weighted
 
 
-def _weighted_moments(color: Tensor, alpha: Tensor, light: Tensor, direction: int) -> Tensor:
-    """Returns the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
+def _weigh_moments(
+    color: Tensor, alpha: Tensor, light: Tensor, direction: int, out: Tensor
+) -> None:
+    """Writes the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
     inside of solids, which no light reaches: there an interval takes the moments of the last one
     before it that light reaches, divided by `FAINT`, so that other directions count more.
     """
@@ -318,7 +328,8 @@ def _weighted_moments(color: Tensor, alpha: Tensor, light: Tensor, direction: in
         source_alpha > 0, alpha / torch.where(source_alpha > 0, source_alpha, 1.0), 0.0
     )
     weight = torch.where(lit, weight, weight / FAINT)
-    return color[3:].gather(1, source_index.expand_as(color[3:])) * weight
+    torch.gather(color[3:], 1, source_index.expand_as(out), out=out)
+    out *= weight
 
 
 @dataclass(frozen=True)
@@ -345,28 +356,38 @@ class _Painter:
         row_position = (values - low) * ((len(rows) - 1) / (high - low))
         row, fraction = row_and_fraction(row_position.flatten(), len(rows))
         next_row = row + 1
-        rgba = [  # `index_select` takes a third of the time of `column[row]`
-            torch.lerp(
-                column.index_select(0, row), column.index_select(0, next_row), fraction
-            ).view_as(values)
-            for column in rows.T.contiguous()
-        ]
-        color = [channel * rgba[3] for channel in rgba[:3]]
-        if self.voxel_sizes is not None:
-            color += [moment * rgba[3] for moment in self.moments(padded_values, self.voxel_sizes)]
-        colors = torch.stack(color)
-        return _Columns(colors, colors, 1 - rgba[3])
 
-    def moments(self, padded_values: Tensor, voxel_sizes: Sequence[float]) -> list[Tensor]:
-        """Returns the products xx xy xz yy yz zz of unit normals; 0 where there is no gradient."""
+        def between_rows(column: Tensor) -> Tensor:
+            # `index_select` takes a third of the time of `column[row]`
+            ends = column.index_select(0, row), column.index_select(0, next_row)
+            return torch.lerp(*ends, fraction).view_as(values)
+
+        *columns, opacity = rows.T.contiguous()
+        alpha = between_rows(opacity)
+        colors = values.new_empty((self.width - 1, *values.shape))
+        for out, column in zip(colors, columns, strict=False):
+            torch.mul(between_rows(column), alpha, out=out)
+        if self.voxel_sizes is not None:
+            self.write_moments(padded_values, self.voxel_sizes, colors[3:])
+            colors[3:] *= alpha
+        return _Columns(colors, colors, 1 - alpha)
+
+    def write_moments(
+        self, padded_values: Tensor, voxel_sizes: Sequence[float], out: Tensor
+    ) -> None:
+        """Writes the products xx xy xz yy yz zz of unit normals; 0 where there is no gradient."""
         slopes = [_upsampled(padded_values, axis) / voxel_sizes[axis] for axis in range(3)]
-        largest = torch.stack([slope.abs() for slope in slopes]).amax(0)
-        scaled = [slope / torch.where(largest > 0, largest, 1.0) for slope in slopes]
+        largest = torch.maximum(torch.maximum(slopes[0].abs(), slopes[1].abs()), slopes[2].abs())
+        divisor = torch.where(largest > 0, largest, 1.0)
+        scaled = [slope / divisor for slope in slopes]
         square = scaled[0] * scaled[0] + scaled[1] * scaled[1] + scaled[2] * scaled[2]
         inverse_square = 1 / torch.where(square > 0, square, 1.0)
         cross_axes = [axis for axis in range(3) if axis != self.column_axis]
         z, y, x = (scaled[[self.column_axis, *cross_axes].index(axis)] for axis in range(3))
-        return [a * b * inverse_square for a, b in ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))]
+        pairs = ((x, x), (x, y), (x, z), (y, y), (y, z), (z, z))
+        for moment, (a, b) in zip(out, pairs, strict=True):
+            torch.mul(a, b, out=moment)
+        out *= inverse_square
 
 
 def _pooled(values: Tensor, block: int) -> Tensor:
