@@ -11,7 +11,7 @@
 #include <type_traits>
 
 #include "shaders/shaders.h"
-#include "shaders/warp_shadows.h"
+#include "shaders/shadows.h"
 
 namespace gvtorch::GV_NAMESPACE {
 
@@ -59,9 +59,7 @@ struct ShadeRay : Walk<T> {
 
   GV_HD void operator()(int64_t index) const {
     const int64_t number = this->order(index);
-#ifdef __CUDA_ARCH__
-    const unsigned lanes = kShadows ? __ballot_sync(__activemask(), number >= 0) : 0;
-#endif
+    [[maybe_unused]] const unsigned threads = kShadows ? threads_where(number >= 0) : 0;
     if (number < 0) return;
     const Ray<T> ray(this->rays, number);
     const Sight<T> sight(this->rays, number, ray.moved);
@@ -75,23 +73,14 @@ struct ShadeRay : Walk<T> {
       return visitor.samples;
     };
     int32_t samples;
-#ifdef __CUDA_ARCH__
     if constexpr (kShadows) {
-      WarpShadows<T, ShadeRay> shadows(*this, ray, sight, lanes);
+      Shadows<T, ShadeRay> shadows{*this, ray, sight, threads};
       samples = trace_ray([&](const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone,
                               int32_t& ray_samples) { shadows.add(piece, point, cone, sum, ray_samples); });
       shadows.finish(sum, samples);
     } else {
       samples = trace_ray(nullptr);
     }
-#else
-    samples =
-        trace_ray([&](const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone, int32_t& ray_samples) {
-          const T share =
-              light.receives(point) ? light_share(ray, sight, cone, ray_samples, sum.missed) : static_cast<T>(1);
-          sum.add(light.in_shadow(point, share), piece);
-        });
-#endif
     if constexpr (Shader::kSurface) {
       if (sum.depth < static_cast<T>(INFINITY)) surface<Digits>(ray, sight, sum);
     }

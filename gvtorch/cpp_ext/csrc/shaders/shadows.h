@@ -1,10 +1,21 @@
-// The shadows that fall on the samples of a warp's rays, on a GPU: its threads trace the cones to the light together.
+// The shadows that fall on the samples of rays: Shadows<T, Kernel> adds intervals with their shadows. On a CPU each ray
+// traces its cones to the light by itself, at once; on a GPU a warp's threads trace those of its rays together.
 #pragma once
 
 #include "shaders/light.h"
 
-#ifdef __CUDACC__
 namespace gvtorch::GV_NAMESPACE {
+
+// The threads of a warp for which `value` is true, a bit each; 0 on a CPU.
+GV_HD unsigned threads_where([[maybe_unused]] bool value) {
+#ifdef __CUDA_ARCH__
+  return __ballot_sync(__activemask(), value);
+#else
+  return 0;
+#endif
+}
+
+#ifdef __CUDACC__
 
 constexpr int32_t kWarpThreads = 32, kBlockWarps = 4;
 
@@ -13,13 +24,13 @@ constexpr int32_t kWarpThreads = 32, kBlockWarps = 4;
 // trace one at a time while the others wait. Only colours wait, which nothing else depends on; they are added in the
 // order of each ray. (packets/packet_shadows.h does the same on a CPU.)
 template <class T, class Kernel>
-class WarpShadows {
+class Shadows {
  public:
-  // `warp_lanes`: the threads of the warp that have a ray.
-  __device__ WarpShadows(const Kernel& kernel, const Ray<T>& ray, const Sight<T>& sight, unsigned warp_lanes)
-      : kernel(kernel), memory(shared()), lanes(warp_lanes), lane(threadIdx.x % kWarpThreads) {
-    memory.ray[lane] = ray;
-    memory.sight[lane] = sight;
+  // `threads`: those of the warp that have a ray.
+  __device__ Shadows(const Kernel& kernel, const Ray<T>& ray, const Sight<T>& sight, unsigned threads)
+      : kernel(kernel), memory(shared()), threads(threads), thread(threadIdx.x % kWarpThreads) {
+    memory.ray[thread] = ray;
+    memory.sight[thread] = sight;
   }
   // Adds an interval.
   __device__ void add(const Piece<T>& piece, const LitPoint<T>& lit_point, const LightCone<T>& to_light,
@@ -29,7 +40,7 @@ class WarpShadows {
     sum.absorb(lit_point.base.alpha, piece);
     if (kernel.light.receives(lit_point)) {
       receiving |= 1u << points;
-      memory.cone_t[cones++][lane] = to_light.t;
+      memory.cone_t[cones++][thread] = to_light.t;
     }
     if (++points == kPoints) add_all(false, sum, samples);
   }
@@ -66,11 +77,11 @@ class WarpShadows {
     int32_t traced = 0;
     GV_NO_UNROLL
     for (int32_t i = 0; i < points; ++i) {
-      const T share = (receiving >> i & 1) != 0 ? memory.share[traced++][lane] : static_cast<T>(1);
+      const T share = (receiving >> i & 1) != 0 ? memory.share[traced++][thread] : static_cast<T>(1);
       sum.add_light(0, kernel.light.in_shadow(point[i], share), weight[i]);
     }
-    samples += memory.samples[lane];
-    sum.missed = sum.missed || memory.missed[lane] != 0;
+    samples += memory.samples[thread];
+    sum.missed = sum.missed || memory.missed[thread] != 0;
     points = cones = 0;
     receiving = 0;
     return all_ended;
@@ -78,17 +89,17 @@ class WarpShadows {
 
   // Traces the cones of all rays; waits until all threads call it. Returns true if `ended` is true for all.
   __device__ __noinline__ bool trace(bool ended) {
-    const unsigned before = lanes & ((1u << lane) - 1);
+    const unsigned before = threads & ((1u << thread) - 1);
     int32_t total = 0;
     GV_NO_UNROLL
     for (int32_t i = 0; i < kPoints; ++i) {
-      const unsigned having = __ballot_sync(lanes, cones > i);
-      if (cones > i) memory.cone[total + __popc(having & before)] = static_cast<uint8_t>(i * kWarpThreads + lane);
+      const unsigned having = __ballot_sync(threads, cones > i);
+      if (cones > i) memory.cone[total + __popc(having & before)] = static_cast<uint8_t>(i * kWarpThreads + thread);
       total += __popc(having);
     }
-    memory.samples[lane] = memory.missed[lane] = 0;
-    __syncwarp(lanes);
-    for (int32_t next = __popc(before); next < total; next += __popc(lanes)) {
+    memory.samples[thread] = memory.missed[thread] = 0;
+    __syncwarp(threads);
+    for (int32_t next = __popc(before); next < total; next += __popc(threads)) {
       const int32_t i = memory.cone[next] / kWarpThreads, owner = memory.cone[next] % kWarpThreads;
       const Sight<T>& sight = memory.sight[owner];
       int32_t samples = 0;
@@ -98,19 +109,38 @@ class WarpShadows {
       atomicAdd(&memory.samples[owner], samples);
       if (missed) memory.missed[owner] = 1;
     }
-    __syncwarp(lanes);
-    return __all_sync(lanes, ended);
+    __syncwarp(threads);
+    return __all_sync(threads, ended);
   }
 
   const Kernel& kernel;
   Memory& memory;
-  const unsigned lanes;
-  const int32_t lane;
+  const unsigned threads;
+  const int32_t thread;
   LitPoint<T> point[kPoints];
   T weight[kPoints];       // share of the picture
   unsigned receiving = 0;  // a bit for each point: it needs a cone
   int32_t points = 0, cones = 0;
 };
 
-}  // namespace gvtorch::GV_NAMESPACE
+#else
+
+template <class T, class Kernel>
+struct Shadows {
+  const Kernel& kernel;
+  const Ray<T>& ray;
+  const Sight<T>& sight;
+  unsigned threads;
+
+  void add(const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone, ShadeSum<T>& sum,
+           int32_t& samples) const {
+    const bool receives = kernel.light.receives(point);
+    const T share = receives ? kernel.light_share(ray, sight, cone, samples, sum.missed) : static_cast<T>(1);
+    sum.add(kernel.light.in_shadow(point, share), piece);
+  }
+  void finish(ShadeSum<T>&, int32_t&) const {}
+};
+
 #endif
+
+}  // namespace gvtorch::GV_NAMESPACE
