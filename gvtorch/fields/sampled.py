@@ -153,7 +153,9 @@ class SampledDistance(Distance):
         return ((center - half >= self.origin) & (center + half <= high)).all(1)
 
     def box(self) -> Tensor:
-        """Returns the box of the voxel centres."""
+        """Returns the box of the voxel centres; beyond it is only what values below 0 on its faces
+        continue.
+        """
         return torch.stack((self.origin, self.origin + self.last * self.spacing))
 
 
