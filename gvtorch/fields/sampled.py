@@ -121,9 +121,7 @@ class SampledDistance(Distance):
         flat = self.values.reshape(-1)
         corners = [
             flat[base_index + (dz * y + dy) * x + dx].to(position)
-            for dz in (0, 1)
-            for dy in (0, 1)
-            for dx in (0, 1)
+            for dz, dy, dx in itertools.product((0, 1), repeat=3)
         ]
         for axis in range(3):
             weight = weights[..., axis]
