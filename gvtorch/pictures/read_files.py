@@ -29,6 +29,7 @@ from ..io.source import convert_errors
 from ..io.tiff_info import check_pictures, opened_tiff
 from .tone import from_srgb
 
+_ASSOCIATED_ALPHA = 1  # as an extra sample of TIFF: colours are premultiplied, as Blender writes
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _MAX_HEADER_BYTES = 1 << 20  # bytes
 _LOCK = threading.Lock()
@@ -204,7 +205,14 @@ def _read_tiff(path: Path) -> np.ndarray:
         _check_size(path, tuple(series.shape), series.dtype.itemsize, max_bytes)
         check_pictures(series.pages)
         pixels = series.asarray()
-        return np.moveaxis(pixels, series.axes.index("S"), -1) if "S" in series.axes else pixels
+        if "S" in series.axes:
+            pixels = np.moveaxis(pixels, series.axes.index("S"), -1)
+        if pixels.dtype.kind == "u" and series.pages[0].extrasamples[:1] == (_ASSOCIATED_ALPHA,):
+            largest, alpha = np.iinfo(pixels.dtype).max, pixels[..., 3:4].astype(np.float64)
+            straight = pixels[..., :3] * (largest / np.maximum(alpha, 1))
+            straight = straight.clip(max=largest).round().astype(pixels.dtype)
+            return np.concatenate((straight, pixels[..., 3:4]), -1)
+        return pixels
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
