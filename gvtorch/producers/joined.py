@@ -100,7 +100,8 @@ class JoinedProducer(OfProducers):
             for n, answer in answers.items()
         }
         kind = self._kinds(nodes, [answer.kind for answer in regions.values()])
-        constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
+        constants: dict[str, Tensor] = {}
+        ranges: dict[str, Tensor] = {}
         for name, answer in regions.items():
             ((channel_name, channel),) = self.parts()[name].channels.items()
             zero = torch.zeros((len(kind), channel.width), dtype=channel.dtype, device=kind.device)
@@ -112,7 +113,9 @@ class JoinedProducer(OfProducers):
         return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(regions))
 
     def _bricks(self, nodes: Nodes, answers: Mapping[str, Any]) -> Bricks:
-        data, constants, bricks = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
+        data: dict[str, Any] = {}
+        constants: dict[str, Tensor] = {}
+        bricks: dict[str, Bricks] = {}
         for name, producer in self.parts().items():
             answer = bricks[name] = producer.as_bricks(answers[name])
             (channel_name,) = producer.channels
