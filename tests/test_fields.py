@@ -324,6 +324,17 @@ def test_what_is_unknown_is_no_error():
             gv.FieldProducer(Bounded(lambda x: None, box), 64)
 
 
+def test_joined_bricks_compile_whole():
+    parts = {"a": sdf.Sphere(0.7), "b": sdf.Box()}
+    fields = {name: gv.Solid(shape, colors=False) for name, shape in parts.items()}
+    joined = gv.JoinedProducer({n: gv.FieldProducer(f, 32, box=BOX) for n, f in fields.items()})
+    nodes = nodes_of(joined, 1)
+    expected = joined.fill(nodes).data
+    compiled = torch.compile(joined.fill, fullgraph=True, dynamic=False, backend="eager")
+    for name, rows in compiled(nodes).data.items():
+        assert torch.equal(rows, expected[name])
+
+
 @pytest.mark.parametrize("colors", [False, True])
 def test_producers_of_fields_compile_whole(colors):
     """Nothing breaks the graph: neither gradients nor intervals read values on the host."""

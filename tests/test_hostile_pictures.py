@@ -153,6 +153,43 @@ def test_a_volume_is_no_picture_and_planes_of_colour_are(tmp_path):
             gv.read_image(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("corner", "size"), [((2, 1), (20, 10)), ((-2, -1), (4, 4)), ((9, 0), (5, 6))]
+)
+def test_an_exr_of_a_part_of_its_picture_lies_where_it_belongs(tmp_path, corner, size):
+    exr = pytest.importorskip("OpenEXR")
+    values = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
+    (left, top), (width, height) = corner, size
+    header = {
+        "compression": exr.ZIP_COMPRESSION,
+        "type": exr.scanlineimage,
+        "dataWindow": tuple(np.array((left + n, top + m), np.int32) for n, m in ((0, 0), (7, 5))),
+        "displayWindow": tuple(np.array(n, np.int32) for n in ((0, 0), (width - 1, height - 1))),
+    }
+    exr.File(header, {"RGB": values}).write(str(tmp_path / "a.exr"))
+    plane = np.zeros((40, 40, 3), np.float32)  # from -10, -10
+    plane[10 + top : 16 + top, 10 + left : 18 + left] = values
+    expected = plane[10 : 10 + height, 10 : 10 + width]
+    assert np.array_equal(gv.read_image(tmp_path / "a.exr").numpy(), expected)
+
+
+def test_premultiplied_integers_of_a_tiff_become_straight(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    straight = np.random.default_rng(0).integers(0, 2**16, (6, 9, 4), np.uint16)
+    straight[0, 0, 3], straight[0, 1] = 0, 65535
+    alpha = straight[..., 3:] / 65535
+    premultiplied = np.concatenate(((straight[..., :3] * alpha).round(), straight[..., 3:]), -1)
+    for name, pixels, kind in (
+        ("straight", straight, "unassalpha"),
+        ("premultiplied", premultiplied.astype(np.uint16), "assocalpha"),
+    ):
+        path = tmp_path / f"{name}.tif"
+        tifffile.imwrite(path, pixels, photometric="rgb", extrasamples=[kind])
+    expected, read = (gv.read_image(tmp_path / f"{n}.tif") for n in ("straight", "premultiplied"))
+    assert torch.equal(read[..., 3], expected[..., 3])
+    assert ((read - expected).abs() * expected[..., 3:]).max() < 1e-4
+
+
 def test_floats_of_pictures_beyond_float32_are_infinite_without_a_warning(tmp_path):
     np.save(tmp_path / "a.npy", np.full((2, 2, 3), 1e300))
     assert torch.isinf(gv.read_image(tmp_path / "a.npy")).all()

@@ -121,9 +121,7 @@ class SampledDistance(Distance):
         flat = self.values.reshape(-1)
         corners = [
             flat[base_index + (dz * y + dy) * x + dx].to(position)
-            for dz in (0, 1)
-            for dy in (0, 1)
-            for dx in (0, 1)
+            for dz, dy, dx in itertools.product((0, 1), repeat=3)
         ]
         for axis in range(3):
             weight = weights[..., axis]
@@ -153,7 +151,9 @@ class SampledDistance(Distance):
         return ((center - half >= self.origin) & (center + half <= high)).all(1)
 
     def box(self) -> Tensor:
-        """Returns the box of the voxel centres."""
+        """Returns the box of the voxel centres; beyond it is only what values below 0 on its faces
+        continue.
+        """
         return torch.stack((self.origin, self.origin + self.last * self.spacing))
 
 

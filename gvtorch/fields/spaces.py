@@ -206,6 +206,8 @@ class Repeat(Space):
                 and check.integer(context, "count", axis_count, low=1) % 2 == 0
             ):
                 raise ValueError(f"{context}: count must be odd, got {counts}")
+        cut = any(isinstance(part, Intersection) for part in shape.modules())
+        self._jumps = cut or not shape.exact  # whether values are no distances, see `slope`
         self._max_cell = [
             math.inf if axis_count is None else (axis_count - 1) // 2 for axis_count in counts
         ]
@@ -240,10 +242,8 @@ class Repeat(Space):
         """Returns a huge slope for boxes in which the two nearest cells change: there the value
         jumps, unless it is a distance, which no other copy can be nearer than.
         """
-        slope, parts = super().slope(center, half), self.shape.modules()
-        if self.shape.exact and not any(isinstance(part, Intersection) for part in parts):
-            return slope
-        for axis in self._axes:
+        slope = super().slope(center, half)
+        for axis in self._axes if self._jumps else ():
             first, last = (
                 (end[:, axis] / self.period[axis])
                 .floor()

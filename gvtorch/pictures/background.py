@@ -84,10 +84,8 @@ class Backdrop(Background):
         if self.image.device != device and device not in self._uploaded:
             self._uploaded[device] = self.image.to(device)
         top = camera.window[0]
-        image = self._uploaded.get(device, self.image)[..., top : top + camera.height, :, :].to(
-            dtype
-        )
-        return _by_pixel(image, camera)
+        rows = self._uploaded.get(device, self.image)[..., top : top + camera.height, :, :]
+        return _by_pixel(rows.to(dtype), camera)
 
 
 class Environment(Background):
@@ -105,7 +103,7 @@ class Environment(Background):
             rotation: (3, 3) from world directions to those of the map.
 
         Raises:
-            ValueError: A shape is wrong, a value is NaN or infinite, or the matrix is no rotation.
+            ValueError: A shape is wrong, a value is not finite, or the matrix is not orthonormal.
         """
         check.images("Environment", "image", image, 3, batch=False)
         if not bool(torch.isfinite(image).all()):

@@ -101,11 +101,9 @@ class Progressive:
                 self.reset()
             self._last_argument, self._camera = camera, converted
         current_camera = self._camera
-        picture = self._render(
-            current_camera.shifted(*jitter(self.count), sample=self.count)
-            if self.count
-            else current_camera
-        )
+        if self.count:
+            current_camera = current_camera.shifted(*jitter(self.count), sample=self.count)
+        picture = self._render(current_camera)
         rgba = torch.cat((picture.color, picture.alpha), -1).double()
         missed = picture.missed
         complete = torch.ones_like(picture.alpha, dtype=torch.bool) if missed is None else ~missed

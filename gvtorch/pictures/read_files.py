@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base.boxes import paste
 from ..base.messages import need_library
 from ..io.budget import MAX_UNPACK_RATIO, check_regular, header_budget
 from ..io.picture_size import picture_size
@@ -28,6 +29,7 @@ from ..io.source import convert_errors
 from ..io.tiff_info import check_pictures, opened_tiff
 from .tone import from_srgb
 
+_ASSOCIATED_ALPHA = 1  # as an extra sample of TIFF: colours are premultiplied, as Blender writes
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _MAX_HEADER_BYTES = 1 << 20  # bytes
 _LOCK = threading.Lock()
@@ -102,7 +104,7 @@ def _read_png(path: Path) -> np.ndarray:
 
 def _read_exr(path: Path) -> np.ndarray:
     library = need_library(".exr", "OpenEXR", extra="image")
-    _check_exr(path)
+    data, display = _exr_windows(path)
     with _quiet():
         parts = library.File(str(path), separate_channels=True).parts
     if not parts:
@@ -113,7 +115,13 @@ def _read_exr(path: Path) -> np.ndarray:
     if missing:
         listed = ", ".join(map(repr, channels))
         raise ValueError(f"has no channel {missing[0]!r}; it has {listed}")
-    return np.stack([channels[name].pixels for name in names], -1)
+    pixels = np.stack([channels[name].pixels for name in names], -1)
+    if data == display:
+        return pixels
+    top, left, bottom, right = display
+    picture = np.zeros((bottom - top, right - left, len(names)), pixels.dtype)
+    paste(picture, (top, left), pixels, data[:2])
+    return picture
 
 
 @contextmanager
@@ -130,10 +138,11 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _check_exr(path: Path) -> None:
-    """Raises ValueError if the header declares several parts, which are not supported, or more
-    pixels than the file can hold: a file has an offset for at least every 256 lines, and OpenEXR
-    allocates memory for all lines.
+def _exr_windows(path: Path) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Returns top, left, bottom, right of the pixels that a file holds, and of the picture, which
+    may be another part of the plane. Raises ValueError if the header declares several parts, which
+    are not supported, or more pixels than the file can hold: a file has an offset for at least
+    every 256 lines, and OpenEXR allocates memory for all lines.
     """
     with path.open("rb") as file:
         header = file.read(_MAX_HEADER_BYTES)
@@ -144,13 +153,18 @@ def _check_exr(path: Path) -> None:
     attributes = dict(_attributes(header))
     if "dataWindow" not in attributes or "channels" not in attributes:
         raise ValueError("damaged: its header has no extent or no channels")
-    left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
-    count = sum(1 for _ in _channels(attributes["channels"]))
-    lines, size = bottom - top + 1, path.stat().st_size
-    shape = (lines, right - left + 1, count)
-    if min(shape) < 1 or lines // 256 * 8 > size:
-        raise ValueError(f"damaged: declares {shape} numbers in {size} bytes")
-    _check_size(path, shape, 1, MAX_UNPACK_RATIO * size * 4)
+    count, size = sum(1 for _ in _channels(attributes["channels"])), path.stat().st_size
+    windows, max_bytes = [], MAX_UNPACK_RATIO * size * 4
+    for name in ("dataWindow", "displayWindow"):
+        window = attributes.get(name, attributes["dataWindow"])
+        left, top, right, bottom = struct.unpack("<4i", window)
+        shape = (bottom - top + 1, right - left + 1, count)
+        if min(shape) < 1 or (max_bytes and shape[0] // 256 * 8 > size):
+            raise ValueError(f"damaged: declares {shape} numbers in {size} bytes")
+        _check_size(path, shape, 1, max_bytes)
+        windows.append((top, left, bottom + 1, right + 1))
+        max_bytes = 0  # of the picture the file holds a part
+    return windows[0], windows[1]
 
 
 def _attributes(header: bytes) -> Iterator[tuple[str, bytes]]:
@@ -191,7 +205,14 @@ def _read_tiff(path: Path) -> np.ndarray:
         _check_size(path, tuple(series.shape), series.dtype.itemsize, max_bytes)
         check_pictures(series.pages)
         pixels = series.asarray()
-        return np.moveaxis(pixels, series.axes.index("S"), -1) if "S" in series.axes else pixels
+        if "S" in series.axes:
+            pixels = np.moveaxis(pixels, series.axes.index("S"), -1)
+        if pixels.dtype.kind == "u" and series.pages[0].extrasamples[:1] == (_ASSOCIATED_ALPHA,):
+            largest, alpha = np.iinfo(pixels.dtype).max, pixels[..., 3:4].astype(np.float64)
+            straight = pixels[..., :3] * (largest / np.maximum(alpha, 1))
+            straight = straight.clip(max=largest).round().astype(pixels.dtype)
+            return np.concatenate((straight, pixels[..., 3:4]), -1)
+        return pixels
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {

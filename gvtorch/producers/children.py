@@ -17,7 +17,7 @@ from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions, raise_first
-from .nodes import Layout, Nodes, grid_of
+from .nodes import Layout, Nodes, along_axes, grid_of
 from .producer import (
     Bricks,
     OfProducers,
@@ -167,19 +167,11 @@ class FromChildren(OfProducers):
         step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
         last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
         voxel = (low[:, :, None] + torch.arange(size)).clamp(min=0).minimum(last)
-        x, y, z = (voxel // brick).unbind(1)
-        grid = torch.stack(
-            torch.broadcast_tensors(x[:, None, None], y[:, None, :, None], z[:, :, None, None]), -1
-        )
+        grid = torch.stack(torch.broadcast_tensors(*along_axes(voxel // brick)), -1)
         block, block_row = distinct_rows(grid.reshape(-1, 3))
         blocks = self._blocks(layout, torch.cat((block, torch.full_like(block[:, :1], depth)), 1))
-        inner = (voxel % brick).numpy()
-        inner_index = (
-            inner[:, 2, :, None, None],
-            inner[:, 1, None, :, None],
-            inner[:, 0, None, None],
-        )
-        index = (block_row.view(grid.shape[:4]).numpy(), *inner_index)
+        x, y, z = along_axes(voxel % brick)
+        index = tuple(n.numpy() for n in (block_row.view(grid.shape[:4]), z, y, x))
         return {name: values[index] for name, values in blocks.items()}
 
     def _blocks(self, layout: Layout, loc: Tensor) -> Blocks:
@@ -209,12 +201,10 @@ class FromChildren(OfProducers):
             blocks[name][:] = to_numpy(values.cpu())[:, None, None, None]
         detailed = ((kind != Region.EMPTY) & (kind != Region.CONSTANT)).nonzero()[:, 0]
         if len(detailed):
-            is_finest = int(loc[0, 3]) == layout.depth
-            voxels = (
-                self._finest_voxels(nodes[detailed])
-                if is_finest
-                else self._means(layout, loc[detailed])
-            )
+            if int(loc[0, 3]) == layout.depth:
+                voxels = self._finest_voxels(nodes[detailed])
+            else:
+                voxels = self._means(layout, loc[detailed])
             for name, rows in voxels.items():
                 blocks[name][detailed.numpy()] = rows
         return blocks

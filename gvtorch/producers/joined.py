@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -78,17 +78,11 @@ class JoinedProducer(OfProducers):
         self.producers = modules_by_name(context, producers)
         self.on_host = all(producer.on_host for producer in producers.values())
         self.on_device = all(producer.on_device for producer in producers.values())
-        waits = [
-            producer.patience for producer in producers.values() if producer.patience is not None
-        ]
-        self.patience = max(waits) if waits else None
+        waits = (part.patience for part in producers.values() if part.patience is not None)
+        self.patience = max(waits, default=None)
 
     def parts(self) -> dict[str, Producer]:
-        return {
-            name: producer
-            for name, producer in self.producers.items()
-            if isinstance(producer, Producer)
-        }
+        return cast("dict[str, Producer]", dict(self.producers.items()))
 
     def classify(self, nodes: Nodes) -> Regions | Future:
         """Joins the regions of all producers."""
@@ -106,7 +100,8 @@ class JoinedProducer(OfProducers):
             for n, answer in answers.items()
         }
         kind = self._kinds(nodes, [answer.kind for answer in regions.values()])
-        constants, ranges = dict[str, Tensor](), dict[str, Tensor]()
+        constants: dict[str, Tensor] = {}
+        ranges: dict[str, Tensor] = {}
         for name, answer in regions.items():
             ((channel_name, channel),) = self.parts()[name].channels.items()
             zero = torch.zeros((len(kind), channel.width), dtype=channel.dtype, device=kind.device)
@@ -118,7 +113,9 @@ class JoinedProducer(OfProducers):
         return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(regions))
 
     def _bricks(self, nodes: Nodes, answers: Mapping[str, Any]) -> Bricks:
-        data, constants, bricks = dict[str, Any](), dict[str, Tensor](), dict[str, Bricks]()
+        data: dict[str, Any] = {}
+        constants: dict[str, Tensor] = {}
+        bricks: dict[str, Bricks] = {}
         for name, producer in self.parts().items():
             answer = bricks[name] = producer.as_bricks(answers[name])
             (channel_name,) = producer.channels

@@ -210,14 +210,14 @@ class Nodes:
         hundredth of the memory that `positions` take. Beyond 2^18 voxels from the world's origin
         float32 is exact to 1/64 of a voxel at best: see `local_axes`.
         """
-        return _broadcast(self._coordinates)
+        return along_axes(self._coordinates)
 
     @property
     def local_axes(self) -> tuple[Tensor, Tensor, Tensor]:
         """The same relative to the brick's `center`: exact at any depth. `center` is float64, so
         `nodes.center[:, 0, None, None, None] + x` is a world coordinate in float64.
         """
-        return _broadcast(self._local_coordinates)
+        return along_axes(self._local_coordinates)
 
     @property
     def positions(self) -> Tensor:
@@ -273,7 +273,7 @@ class Nodes:
         )
 
 
-def _broadcast(coordinates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def along_axes(coordinates: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Reshapes (k, 3, s) coordinates along each axis so that they broadcast to (k, z, y, x)."""
     x, y, z = coordinates.unbind(1)
     return x[:, None, None, :], y[:, None, :, None], z[:, :, None, None]
