@@ -104,6 +104,8 @@ def test_a_misspelt_word_gets_the_right_one(small, tmp_path):
         (["rendr", small], "(did you mean render?)"),
         (["render", small, "-o", "a.png", "--camra", "orbit:1,2"], "(did you mean --camera?)"),
         (["slice", small, "-o", "a.png", "--axiz", "z"], "Unrecognized options: --axiz"),
+        (["slice", small, small, "-o", "a.png"], f"options: {small}; gvtorch COMMAND --help"),
+        (["slice", small, "-o", "a.png", "--scale", "x"], "float: 'x'; gvtorch COMMAND --help"),
         (["info", small, "--size", "8x8"], "Unrecognized options: --size 8x8; gvtorch COMMAND"),
         (["render", small, "-o", "a.png", "--tf", "bnoe"], "(did you mean bone"),
         (["render", small, "-o", "a.png", "--tf", "virids"], "(did you mean viridis"),
