@@ -203,6 +203,17 @@ def test_flags_that_would_do_nothing_are_refused(small, scan_store, tmp_path, ma
     assert message in run.stderr and not [*tmp_path.glob("*.png"), *tmp_path.glob("a.*")]
 
 
+def test_a_flight_does_not_overwrite_its_background(small, tmp_path):
+    from PIL import Image
+
+    Image.new("RGB", (8, 4)).save(tmp_path / "0001.png")
+    before = (tmp_path / "0001.png").read_bytes()
+    flags = ("--frames", 2, "--size", "8x8", "--background", tmp_path / "0001.png")
+    run = gvtorch("fly", small, "-o", tmp_path, *flags)
+    assert run.returncode == 2 and "would be written over what --background reads" in run.stderr
+    assert (tmp_path / "0001.png").read_bytes() == before
+
+
 def test_a_component_that_is_not_there_names_what_is(small, scan_store, tmp_path):
     np.save(tmp_path / "two.npy", np.zeros((5, 6, 7, 2), np.uint8))
     for command in ("render", "slice"):
