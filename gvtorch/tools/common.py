@@ -178,9 +178,9 @@ def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None])
         if not path.parent.is_dir():
             raise FileNotFoundError(f"{flag}: folder not found: {path.parent}")
         real_path = Path(os.path.realpath(path))
-        for file, input_flag in input_flags.items():
-            is_numbered = file.suffix == ".png" and file.stem.isdigit()
-            if file in (real_path, real_path.parent) or (is_numbered and file.parent == real_path):
+        for source, input_flag in input_flags.items():
+            is_picture = source.parent == real_path and source.match("[0-9]*.png")
+            if source in (real_path, real_path.parent) or is_picture:
                 raise ValueError(f"{flag} {path} would be written over what {input_flag} reads")
         if real_path in output_flags:
             raise ValueError(f"{flag} and {output_flags[real_path]} are one file: {path}")
