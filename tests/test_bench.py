@@ -204,6 +204,7 @@ def test_the_command_lists_and_names_mistakes():
     )
     assert listed.returncode == 0
     assert [line.split()[0] for line in listed.stdout.splitlines()] == [*bench.WORKLOADS]
+    assert json.loads(gvtorch("bench", "--json").stdout) == bench.WORKLOADS
     for args, message in (
         (["nonsense"], "unknown workload 'nonsense'; known: march"),
         (["lru", "--peers", "nobody"], "unknown peer 'nobody'; known: grid_sample"),

@@ -104,6 +104,8 @@ def test_a_misspelt_word_gets_the_right_one(small, tmp_path):
         (["rendr", small], "(did you mean render?)"),
         (["render", small, "-o", "a.png", "--camra", "orbit:1,2"], "(did you mean --camera?)"),
         (["slice", small, "-o", "a.png", "--axiz", "z"], "Unrecognized options: --axiz"),
+        (["slice", small, small, "-o", "a.png"], f"options: {small}; gvtorch COMMAND --help"),
+        (["slice", small, "-o", "a.png", "--scale", "x"], "float: 'x'; gvtorch COMMAND --help"),
         (["info", small, "--size", "8x8"], "Unrecognized options: --size 8x8; gvtorch COMMAND"),
         (["render", small, "-o", "a.png", "--tf", "bnoe"], "(did you mean bone"),
         (["render", small, "-o", "a.png", "--tf", "virids"], "(did you mean viridis"),
@@ -199,6 +201,17 @@ def test_flags_that_would_do_nothing_are_refused(small, scan_store, tmp_path, ma
     run = gvtorch(*(paths.get(arg, arg) for arg in make(tmp_path)))
     assert run.returncode == 2 and len(run.stderr.splitlines()) == 1, run.stderr
     assert message in run.stderr and not [*tmp_path.glob("*.png"), *tmp_path.glob("a.*")]
+
+
+def test_a_flight_does_not_overwrite_its_background(small, tmp_path):
+    from PIL import Image
+
+    Image.new("RGB", (8, 4)).save(tmp_path / "0001.png")
+    before = (tmp_path / "0001.png").read_bytes()
+    flags = ("--frames", 2, "--size", "8x8", "--background", tmp_path / "0001.png")
+    run = gvtorch("fly", small, "-o", tmp_path, *flags)
+    assert run.returncode == 2 and "would be written over what --background reads" in run.stderr
+    assert (tmp_path / "0001.png").read_bytes() == before
 
 
 def test_a_component_that_is_not_there_names_what_is(small, scan_store, tmp_path):

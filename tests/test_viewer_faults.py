@@ -442,3 +442,24 @@ def test_a_scene_of_another_size_has_its_own_box_and_slices():
         page.until(lambda: page.pictures[-1][0]["layout"]["x"]["columns"][2] == 31.5)
     finally:
         session.close()
+
+
+def test_a_shader_that_does_not_scatter_takes_the_place_of_one_that_does():
+    """`octaves` are left out, and their control is dimmed; also of a light at the eye."""
+    sun = gv.DirectionalLight((1, -1, -2))
+    session = new_session(bright_ball(), gv.Lit(FUNCTION, light=sun, octaves=2))
+    try:
+        page = Page(session)
+        page.final()
+        assert "Lit.octaves" not in page.of_type("welcome")[0]["unfit"]
+        page.send("change", state={"shader": {"kind": "Isosurface", "value": 90, "octaves": 2}})
+        answer = page.next("state", 0)
+        assert "left out: render: shadows per sample are for Lit" in page.of_type("note")[0]["text"]
+        assert answer["state"]["shader"]["octaves"] == 0 and "Isosurface.octaves" in answer["unfit"]
+        page.send("change", state={"shader": {"value": 80}})  # of the present kind
+        shader = page.next("state", 1)["state"]["shader"]
+        assert shader["kind"] == "Isosurface" and shader["value"] == 80
+        page.final()
+        assert not page.of_type("error") and not page.of_type("refused")
+    finally:
+        session.close()

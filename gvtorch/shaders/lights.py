@@ -218,13 +218,18 @@ class LitShader(Shader):
         arguments = super().shading(context, tree)
         if arguments is None or not (self.shadows or self.octaves):
             return arguments
+        if self.octaves or self.shadowed_kind is None:
+            self.check_scattering(context)
+        return arguments._replace(shader=shader_number(str(self.shadowed_kind)))
+
+    def check_scattering(self, context: str) -> None:
+        """Raises ValueError if the shader or its light does not support `octaves`."""
         if self.shadowed_kind is None:
             raise ValueError(f"{context}: shadows per sample are for Lit and StoredColor")
-        if self.octaves and isinstance(self.light, Headlight):
+        if isinstance(self.light, Headlight):
             raise ValueError(
                 f"{context}: octaves of scattering need a sun or lamp, got a Headlight"
             )
-        return arguments._replace(shader=shader_number(self.shadowed_kind))
 
     def own_light(self) -> Light:
         return self.light

@@ -42,8 +42,8 @@ class Bench:
         from ..bench import WORKLOADS, Unavailable
 
         if self.name is None:
-            for name, description in WORKLOADS.items():
-                print(f"{name:10} {description}")
+            listing = [f"{name:10} {description}" for name, description in WORKLOADS.items()]
+            print(json.dumps(WORKLOADS) if self.json else "\n".join(listing))
             return
         names = [*WORKLOADS] if self.name == "all" else [self.name]
         if names[0] not in WORKLOADS:

@@ -251,14 +251,13 @@ def _unbox_error(error_text: str) -> str:
     """Returns the parser's boxed error as one line, with suggestions for an unknown flag."""
     text = re.sub(r"╭.*╮|[^\x20-\x7e]+|[-+|]{3,}", " ", error_text)  # without frame and title
     message = re.sub(r" \(applied to [^)]*\)", "", " ".join(text.split()))
-    unknown = re.match(r"Unrecognized (or misplaced )?options: (--[\w-]+)", message)
-    if unknown is None:
-        return message
-    elsewhere, flag = unknown.groups()  # a flag that another command has is "misplaced"
-    known_flags = set(re.findall(r"--[\w-]+", message)) - {flag, "--help"}
-    suggestion = "" if elsewhere else did_you_mean(flag, known_flags)
-    ending = r" Arguments are applied| Perhaps you meant| Available subcommands| For full helptext"
-    sentence = re.split(ending, message)[0].replace(" or misplaced", "")
+    unknown = re.match(r"Unrecognized options: (--[\w-]+)", message)
+    suggestion = ""  # for none that another command has: it is "misplaced"
+    if unknown is not None:
+        known_flags = set(re.findall(r"--[\w-]+", message)) - {unknown[1], "--help"}
+        suggestion = did_you_mean(unknown[1], known_flags)
+    ending = r"Arguments are|Perhaps you meant|Available subcommands|(Argument|For full) helptext"
+    sentence = re.sub(rf"\.? ({ending}).*", "", message).replace(" or misplaced", "")
     return f"{sentence}{suggestion}; gvtorch COMMAND --help tells all"
 
 

@@ -160,16 +160,17 @@ def open_data(path: str, options: ReadOptions, *, image: str | None, level: int)
 
 
 def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None]) -> None:
-    """Raises ValueError if a command would overwrite a file that it reads, or one in a folder that
-    it reads, or write a file twice, FileNotFoundError if the folder of an output is missing.
-    `inputs` and `outputs` map flags to paths; a text in `inputs` may also be FILE:NAME or
-    FILE,NAME, or no path at all.
+    """Raises ValueError if a command would overwrite a file that it reads (in a folder of pictures:
+    a numbered PNG), or one in a folder that it reads, or write a file twice, FileNotFoundError if
+    the folder of an output is missing. `inputs` and `outputs` map flags to paths; a text in
+    `inputs` may also be FILE:NAME or FILE,NAME, or no path at all.
     """
     input_flags: dict[Path, str] = {}
     for flag, text in inputs.items():
         for file in (str(text), *(str(text).rpartition(separator)[0] for separator in ":,")):
             if text is not None and os.path.exists(file):
                 input_flags[Path(os.path.realpath(file))] = flag
+                break
     output_flags: dict[Path, str] = {}
     for flag, path in outputs.items():
         if path is None:
@@ -177,9 +178,10 @@ def check_outputs(inputs: Mapping[str, Any], outputs: Mapping[str, Path | None])
         if not path.parent.is_dir():
             raise FileNotFoundError(f"{flag}: folder not found: {path.parent}")
         real_path = Path(os.path.realpath(path))
-        input_flag = input_flags.get(real_path, input_flags.get(real_path.parent))
-        if input_flag is not None:
-            raise ValueError(f"{flag} {path} would be written over what {input_flag} reads")
+        for source, input_flag in input_flags.items():
+            is_picture = source.parent == real_path and source.match("[0-9]*.png")
+            if source in (real_path, real_path.parent) or is_picture:
+                raise ValueError(f"{flag} {path} would be written over what {input_flag} reads")
         if real_path in output_flags:
             raise ValueError(f"{flag} and {output_flags[real_path]} are one file: {path}")
         output_flags[real_path] = flag

@@ -10,15 +10,7 @@ import tyro
 from tyro.conf import Positional
 
 from ..base.messages import printable
-from .common import (
-    Bar,
-    ReadOptions,
-    Switch,
-    check_outputs,
-    open_data,
-    option,
-    volume_formats,
-)
+from .common import Bar, ReadOptions, Switch, check_outputs, open_data, option, volume_formats
 from .parse import parse_transfer, parse_window
 
 

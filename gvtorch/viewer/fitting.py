@@ -6,19 +6,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ..shaders.lights import LitShader
 from ..tracing import Clip, Lighting, RenderOptions, ThinLens
 from ..tracing.effects import check_fits
 from .state import ViewState, costed
 
 _DEFAULTS = RenderOptions()
 _LENS = ThinLens(aperture=0.1, focus=1.0)
-# Controls (`Class.field`), and the change of a state that turns each of them off.
+# Controls (`Class.field`; LitShader: the class of the shader), and the change of a state that turns
+# each of them off.
 _TURNED_OFF = {
     "RenderOptions.lighting": {"options": {"lighting": None}},
     "Lighting.indirect": {"options": {"lighting": {"indirect": 0.0}}},
     "RenderOptions.lens": {"options": {"lens": None}},
     "RenderOptions.lod": {"options": {"lod": "auto"}},
     "Clip.caps": {"options": {"clip": {"caps": False}}},
+    "LitShader.octaves": {"shader": {"octaves": 0}},
     "ViewState.show": {"show": "picture"},
 }
 
@@ -36,12 +39,21 @@ def _check_control(control: str, state: ViewState) -> None:
         _ = replace(_DEFAULTS, lod="finest", lens=options.lens)
     elif control == "Clip.caps":
         check_fits(shader, replace(_DEFAULTS, clip=Clip(caps=True)))
+    elif control == "LitShader.octaves":
+        if isinstance(shader, LitShader):
+            shader.check_scattering("render")
     else:
         costed(shader)
 
 
 def unfit(state: ViewState) -> dict[str, str]:
     """Returns why, for each control (`Class.field`) that can't be used with the rest of a state."""
+    kind = type(state.shader).__name__
+    return {c.replace("LitShader", kind): reason for c, reason in _reasons(state).items()}
+
+
+def _reasons(state: ViewState) -> dict[str, str]:
+    """Returns the same by the names of `_TURNED_OFF`."""
     reasons = {}
     for control in _TURNED_OFF:
         try:
@@ -55,7 +67,7 @@ def trimmed(state: ViewState) -> tuple[ViewState, list[str]]:
     """Returns a state without the options that its shader does not support, and the reasons."""
     left_out: list[str] = []
     without_lens = replace(state, options=replace(state.options, lens=None))
-    for control, reason in unfit(without_lens).items():
+    for control, reason in _reasons(without_lens).items():
         owners = {"Lighting": state.options.lighting, "Clip": state.options.clip}
         if owners.get(control.split(".")[0], state) is None:
             continue

@@ -309,7 +309,7 @@ def _decode_mapping(path: str, hint: Any, content: Any, depth: int) -> Any:
 def _decode_object(path: str, hint: type, content: Any, current: Any, depth: int) -> Any:
     if not isinstance(content, dict):
         raise _WrongType(f"a {hint.__name__}")
-    name = content.get("kind", hint.__name__)
+    name = content.get("kind", (hint if current is None else type(current)).__name__)
     kind: Any = KINDS.get(name) if isinstance(name, str) else None
     if kind is None and name == hint.__name__ and is_dataclass(hint):
         kind = hint

@@ -326,11 +326,7 @@ export class App {
     this.link.send("still", { width: this.view.overlayCanvas.width, height: this.view.overlayCanvas.height });
   }
 
-  // Figures, progress and notes.
-
-  setMonitor(on) {
-    this.link.send("monitor", { on });
-  }
+  // Progress and notes.
 
   busy({ pending, misses, crowded }) {
     const remaining = Math.max(pending, misses);

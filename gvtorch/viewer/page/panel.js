@@ -57,7 +57,10 @@ export class Panel {
     const shown = rows.flat().filter(Boolean);
     if (!shown.length) return null;
     const element = el("details.gv-section", { open: this.app.open.has(name) }, el("summary", {}, name), ...shown);
-    element.addEventListener("toggle", () => (element.open ? this.app.open.add(name) : this.app.open.delete(name)));
+    element.addEventListener("toggle", () => {
+      this.app.open[element.open ? "add" : "delete"](name);
+      if (name === "Monitor") this.app.link.send("monitor", { on: element.open });
+    });
     return element;
   }
 
@@ -85,9 +88,6 @@ export class Panel {
       this.section("Monitor", app.monitor.element),
     ];
     this.body.replaceChildren(...sections.filter(Boolean));
-    for (const section of this.body.children) {
-      if (section.firstChild.textContent === "Monitor") section.addEventListener("toggle", () => app.setMonitor(section.open));
-    }
     this.body.scrollTop = top;
     app.monitor.draw();
   }

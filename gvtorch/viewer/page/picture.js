@@ -16,7 +16,6 @@ export class PictureView {
     this.canvas = el("canvas.gv-picture");
     this.overlayCanvas = el("canvas.gv-over");
     this.element = el("div.gv-stage", { tabIndex: 0 }, this.canvas, this.overlayCanvas);
-    this.camera = null;
     this.handles = [];
     this.axisLetters = [];
     this.drawing = Promise.resolve();
@@ -69,7 +68,6 @@ export class PictureView {
       this.latencies.push(performance.now() - head.sent);
       if (this.latencies.length > 500) this.latencies.shift();
     }
-    this.camera = head.camera;
     this.head = head;
     this.drawOverlay();
     this.element.dispatchEvent(new CustomEvent("drawn", { detail: head }));
@@ -93,7 +91,7 @@ export class PictureView {
   }
 
   drawOverlay() {
-    const { app } = this, camera = app.camera ?? this.camera;
+    const { app } = this, { camera } = app;
     const context = this.overlayCanvas.getContext("2d");
     context.clearRect(0, 0, this.overlayCanvas.width, this.overlayCanvas.height);
     this.handles = [];
