@@ -108,6 +108,20 @@ def fetch(url: str) -> Path:
     return version_folder / file.name
 
 
+def content_version(file: Path) -> Version | None:
+    """Returns what identifies the content of a downloaded file: the same for any copy of it, unlike
+    the time of the download. None for other files.
+    """
+    folder = file.parent.parent
+    if not (folder / "about.json").is_file() or folder.parent != cache_folder("downloads"):
+        return None
+    cached = _cached_copy(folder)
+    if cached is not None and cached[0] == file and cached[1]:
+        return cached[1]
+    with file.open("rb") as stream:
+        return {"SHA-256": hashlib.file_digest(stream, "sha256").hexdigest()}
+
+
 def _file_name(url: str) -> str:
     """Returns a file name for a URL, made of harmless characters."""
     name = unquote(urlsplit(url).path.rpartition("/")[2])
