@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import http.server
+import shutil
 import threading
 import time
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.servers import WebServer
-from helpers.stores import noise
+from helpers.stores import noise, stopped_at
 
 import gvtorch as gv
 from gvtorch.io import remote
@@ -126,6 +127,26 @@ def test_without_validators_it_is_downloaded_each_time(server, grid):
     for _ in range(2):
         gv.read_volume(f"{server.url}/x/a.npy")
     assert len(server.sent) == 2
+
+
+@pytest.mark.parametrize("tag", ['"one"', None])
+def test_a_conversion_goes_on_with_a_new_copy_of_the_same_content(
+    tmp_path, server, grid, tag, monkeypatch
+):
+    server.tag, url, target = tag, f"{server.url}/x/a.npy", tmp_path / "a.zarr"
+    with stopped_at(monkeypatch, 1), pytest.raises(KeyboardInterrupt):
+        convert(url, target, workers=1)
+    shutil.rmtree(tmp_path / "cache")  # as if it had to make room
+    store = convert(url, target, resume=True)
+    assert np.array_equal(store.read_region(0, (0, 0, 0), grid.shape)[..., 0], grid)
+    shutil.rmtree(target)
+    with stopped_at(monkeypatch, 1), pytest.raises(KeyboardInterrupt):
+        convert(url, target, workers=1)
+    np.save(tmp_path / "b.npy", grid + 1)
+    server.files["/x/a.npy"] = (tmp_path / "b.npy").read_bytes()
+    server.tag = tag and '"two"'
+    with pytest.raises(ValueError, match="the source is not the one that it was begun with"):
+        convert(url, target, resume=True)
 
 
 def test_the_cache_is_bounded_and_the_oldest_goes(tmp_path, server, grid, monkeypatch):

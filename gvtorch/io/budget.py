@@ -123,11 +123,10 @@ class _Watch:
                 if self._has_ended:
                     return
                 used_seconds = time.clock_gettime(self._clock) - self._start_seconds
-                over_memory = (
-                    used_seconds > _MEMORY_GRACE_SECONDS
-                    and _resident_bytes() - self._start_memory > self._max_bytes
-                )
-                if used_seconds > self._seconds or over_memory:
+                used_bytes = 0
+                if used_seconds > _MEMORY_GRACE_SECONDS:
+                    used_bytes = _resident_bytes() - self._start_memory
+                if used_seconds > self._seconds or used_bytes > self._max_bytes:
                     self._error_sent = True
                     self._raise_in_reader()
                     pause *= 2  # a library may have swallowed it, or it is still propagating

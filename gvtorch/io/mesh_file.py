@@ -64,13 +64,8 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     resolver: Any = _FolderResolver(path)
     try:
         content = cut_polygons(content) if ending == "obj" else content
-        loaded = trimesh.load(
-            io.BytesIO(content),
-            file_type=ending,
-            resolver=resolver,
-            process=False,
-            allow_remote=False,
-        )
+        options: Any = {"file_type": ending, "process": False, "allow_remote": False}
+        loaded = trimesh.load(io.BytesIO(content), resolver=resolver, **options)
         _check_textures(_images(loaded), len(content) + resolver.size)
         parts = _loaded_parts(trimesh, loaded)
     except Exception as error:  # a damaged file may raise anything
@@ -135,11 +130,8 @@ def _images(loaded: Any) -> list[Any]:
     """Returns the textures that trimesh found, which are not decoded yet."""
     parts = getattr(loaded, "geometry", {"": loaded}).values()
     materials = (getattr(getattr(part, "visual", None), "material", None) for part in parts)
-    unique = {id(material): material for material in materials}.values()
-    images = (
-        getattr(material, "baseColorTexture", getattr(material, "image", None))
-        for material in unique
-    )
+    unique = {id(m): m for m in materials}.values()
+    images = (getattr(m, "baseColorTexture", getattr(m, "image", None)) for m in unique)
     return [image for image in images if image is not None]
 
 
@@ -259,15 +251,13 @@ def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh
     material_numbers: dict[int, int] = {}
     vertex_count = 0
     for part in parts:
-        part_faces, part_vertices = (
-            np.asarray(part.faces, np.int64),
-            np.asarray(part.vertices, np.float64),
-        )
-        if part_faces.min() < 0 or part_faces.max() >= len(part_vertices):
-            bad_index = part_faces.min() if part_faces.min() < 0 else part_faces.max()
-            raise ValueError(
-                f"{path}: a triangle refers to vertex {bad_index}, there are {len(part_vertices)}"
-            )
+        part_faces = np.asarray(part.faces, np.int64)
+        part_vertices = np.asarray(part.vertices, np.float64)
+        for index in (part_faces.min(), part_faces.max()):
+            if not 0 <= index < len(part_vertices):
+                raise ValueError(
+                    f"{path}: a triangle refers to vertex {index}, there are {len(part_vertices)}"
+                )
         faces.append(part_faces + vertex_count)
         vertices.append(part_vertices)
         vertex_count += len(part_vertices)

@@ -67,11 +67,8 @@ class MeshSource(VolumeSource):
                 raise ValueError("voxelize: texture is for files: a Mesh has its own")
             mesh, identity, name = mesh_or_path, list[Any](), mesh_or_path.name
         else:
-            mesh, identity, name = (
-                read_mesh(mesh_or_path, texture=texture),
-                fingerprint(mesh_or_path),
-                str(mesh_or_path),
-            )
+            mesh, name = read_mesh(mesh_or_path, texture=texture), str(mesh_or_path)
+            identity = fingerprint(mesh_or_path)
         warn_of_holes(mesh, solid, stacklevel=3)
         identity.insert(0, checksum(v for name, v in _mesh_arrays(mesh).items() if name != "name"))
         voxelizer = Voxelizer(mesh, channels=names, **settings)
@@ -185,10 +182,8 @@ def _mesh_arrays(mesh: Mesh) -> dict[str, np.ndarray]:
 def _load_mesh(file: Path) -> Mesh:
     with np.load(file, allow_pickle=False) as content:
         arrays = dict(content)
-    materials = tuple(
-        Material(
-            **fields | {"color": tuple(fields["color"])}, texture=arrays.pop(f"texture_{i}", None)
-        )
-        for i, fields in enumerate(json.loads(str(arrays.pop("materials"))))
-    )
-    return Mesh(**arrays | {"name": str(arrays["name"])}, materials=materials)
+    materials = []
+    for number, fields in enumerate(json.loads(str(arrays.pop("materials")))):
+        texture = arrays.pop(f"texture_{number}", None)
+        materials.append(Material(**fields | {"color": tuple(fields["color"])}, texture=texture))
+    return Mesh(**arrays | {"name": str(arrays["name"])}, materials=tuple(materials))

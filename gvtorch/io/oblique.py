@@ -73,10 +73,8 @@ class StraightSource(VolumeSource):
         corners = np.array([(x, y, z, 1) for z, y, x in itertools.product(*ends)])
         positions = (corners @ np.array(self.to_inner).T)[:, ::-1]
         shape = np.array(self.inner.extent[::-1])
-        first, last = (
-            np.floor(positions.min(0) - _ROUNDING_VOXELS),
-            np.floor(positions.max(0) + _ROUNDING_VOXELS) + 2,
-        )
+        first = np.floor(positions.min(0) - _ROUNDING_VOXELS)
+        last = np.floor(positions.max(0) + _ROUNDING_VOXELS) + 2
         start, stop = np.maximum(first, 0), np.minimum(last, shape)
         return start.astype(int).tolist(), stop.astype(int).tolist()
 
@@ -152,9 +150,8 @@ def straighten(
     degrees = math.degrees(math.acos(min(1.0, (np.abs(affine[:, :3]).max(0) / lengths).min())))
     message = f"{Path(source.path).name}: voxel axes are turned by {degrees:.3g} degrees"
     if oblique == "keep":
-        pose = _pose(
-            affine[:, :3] / lengths, np.array(source.origin if first_voxel is None else first_voxel)
-        )
+        origin = np.array(source.origin if first_voxel is None else first_voxel)
+        pose = _pose(affine[:, :3] / lengths, origin)
         hint = "" if pose is None else "; info.pose turns them (gv.render(..., pose=...))"
         warnings.warn(f"{message}: kept, and treated as the world's axes{hint}", stacklevel=3)
         info = dataclasses.replace(source.info, pose=pose)

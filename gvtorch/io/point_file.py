@@ -79,15 +79,12 @@ class PointFile:
                     dtypes = {self.columns[name].dtype for name in self.used["colors"]}
                     fields["colors"] = _linear_colors(fields["colors"][:, :3], dtypes)
                 radius = fields["radius"][:, 0] if "radius" in fields else self._constant
-                yield Points(
-                    fields["positions"], fields.get("values"), fields.get("colors"), radius
-                )
+                values, colors = fields.get("values"), fields.get("colors")
+                yield Points(fields["positions"], values, colors, radius)
 
     def _join_columns(self, names: Sequence[str], part: slice) -> np.ndarray:
-        columns = [np.asarray(self.columns[name][part]) for name in names]
-        return np.concatenate(
-            [column[:, None] if column.ndim == 1 else column for column in columns], 1
-        )
+        columns = (np.asarray(self.columns[name][part]) for name in names)
+        return np.concatenate([column.reshape(len(column), -1) for column in columns], 1)
 
 
 def read_points(path: str | Path, **names: Unpack[ColumnNames]) -> Points:
@@ -124,11 +121,8 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
         raise FileNotFoundError(f"file not found: {path}")
     reader = {"npz": _read_npz, "ply": _read_ply}.get(ending, _read_fits)
     with convert_errors(ValueError, str(path), f"can't be read as {ending}"):
-        columns = {
-            n: column
-            for n, column in reader(path).items()
-            if column.dtype.kind in "iuf" and column.ndim
-        }
+        read = reader(path).items()
+        columns = {name: part for name, part in read if part.dtype.kind in "iuf" and part.ndim}
     lengths = [len(column) for column in columns.values()]
     count = max(lengths, key=lengths.count) if lengths else 0  # the length that most columns have
     if not count:
@@ -264,6 +258,7 @@ def _choose_columns(
     """Returns the names of the columns that make up positions, values, colors and radius."""
     widths = {name: math.prod(column.shape[1:]) for name, column in columns.items()}
     by_lower_name = {name.lower(): name for name in columns}
+    singles = {lower: name for lower, name in by_lower_name.items() if widths[name] == 1}
     chosen: dict[str, list[str]] = {}
     argument: Any
     for role, argument in names.items():
@@ -290,12 +285,9 @@ def _choose_columns(
             chosen[role] = matches
 
     def choose_several(role: str, *groups: str) -> bool:
-        for group in groups:
-            column_names = group.split()
-            if all(
-                name in by_lower_name and widths[by_lower_name[name]] == 1 for name in column_names
-            ):
-                chosen[role] = [by_lower_name[name] for name in column_names]
+        for group in map(str.split, groups):
+            if singles.keys() >= set(group):
+                chosen[role] = [singles[name] for name in group]
                 return True
         return False
 

@@ -136,21 +136,10 @@ def splat(
         source = _LitPoints(source, check.number("splat", "opacity", opacity, low=0, high=1))
     folder = target / WORK / "points"
     _sort(source, folder, identity, begun, extent=extent, box=box, memory=memory, progress=progress)
-    volume = SplatSource.of(
-        folder,
-        channel,
-        path="points" if isinstance(points, Points) else str(points),
-        identity=tuple(identity),
-    )
-    return convert(
-        volume,
-        target,
-        block=block,
-        executor=executor,
-        workers=workers,
-        resume=resume,
-        progress=progress,
-    )
+    path = "points" if isinstance(points, Points) else str(points)
+    volume = SplatSource.of(folder, channel, path=path, identity=tuple(identity))
+    options: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
+    return convert(volume, target, resume=resume, progress=progress, **options)
 
 
 def _sort(

@@ -87,13 +87,9 @@ def read_volume(
             not fit.
         ImportError: A library is missing; the message has the pip command that installs it.
     """
-    placement: dict[str, Any] = {
-        "spacing": spacing,
-        "origin": origin,
-        "time": time,
-        "oblique": oblique,
-    }
-    source = open_source(path, max_values=MAX_VOXELS, labels=labels, **placement, **options)
+    placement: dict[str, Any] = {"spacing": spacing, "origin": origin, "oblique": oblique}
+    placement |= {"time": time, "labels": labels}
+    source = open_source(path, max_values=MAX_VOXELS, **placement, **options)
     if time is None and source.times > 1:
         warnings.warn(
             f"{source.path}: has {source.times} time points, this is the first; "
@@ -219,9 +215,8 @@ def read_time_points(source: VolumeSource, first: int = 0, times: int = 1) -> np
     if not isinstance(source, MemorySource) and not is_mapped:
         check_memory(source.path, source.peak_bytes + (times - 1) * source.nbytes)
     kind = "an array" if is_array else find_format(source.path, raw=True).name
-    with convert_errors(
-        ValueError, source.path, f"can't be read as {kind}", StoreError, TimeoutError
-    ):
+    problem = f"can't be read as {kind}"
+    with convert_errors(ValueError, source.path, problem, StoreError, TimeoutError):
         return source.read_times(first, first + times)
 
 

@@ -96,9 +96,8 @@ def fetch(url: str) -> Path:
     with closing(stream):
         folder.mkdir(parents=True, exist_ok=True)
         file = _download(url, folder, stream, size)
-    version_folder = folder / (
-        _version_key(version) if version else file.parent.name.strip(".").split("-")[1]
-    )
+    key = hashlib.sha256(json.dumps(version, sort_keys=True).encode()).hexdigest()[:16]
+    version_folder = folder / (key if version else file.parent.name.strip(".").split("-")[1])
     try:
         file.parent.rename(version_folder)
     except OSError:  # another process has written it already
@@ -109,15 +108,24 @@ def fetch(url: str) -> Path:
     return version_folder / file.name
 
 
+def content_version(file: Path) -> Version | None:
+    """Returns what identifies the content of a downloaded file: the same for any copy of it, unlike
+    the time of the download. None for other files.
+    """
+    folder = file.parent.parent
+    if not (folder / "about.json").is_file() or folder.parent != cache_folder("downloads"):
+        return None
+    cached = _cached_copy(folder)
+    if cached is not None and cached[0] == file and cached[1]:
+        return cached[1]
+    with file.open("rb") as stream:
+        return {"SHA-256": hashlib.file_digest(stream, "sha256").hexdigest()}
+
+
 def _file_name(url: str) -> str:
     """Returns a file name for a URL, made of harmless characters."""
     name = unquote(urlsplit(url).path.rpartition("/")[2])
     return re.sub(r"[^\w.+-]", "_", name).lstrip(".")[-120:] or "file"
-
-
-def _version_key(version: Version) -> str:
-    text = json.dumps(version, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _cached_copy(folder: Path) -> tuple[Path, Version] | None:
@@ -137,9 +145,7 @@ Download = tuple[IO[bytes], int | None, Version]
 def _open_http(url: str, known_version: Version) -> Download | None:
     """Begins a download; returns None if the server still has the known version."""
     validators = (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since"))
-    conditions = {
-        header: known_version[name] for name, header in validators if known_version.get(name)
-    }
+    conditions = {header: known_version[n] for n, header in validators if known_version.get(n)}
     try:
         response = ask_by_urllib(url, REQUEST_HEADERS | conditions, _TIMEOUT)
     except HttpStatus as error:
@@ -149,11 +155,7 @@ def _open_http(url: str, known_version: Version) -> Download | None:
             raise FileNotFoundError(f"volume not found: {url}") from None
         raise
     length = response.headers.get("Content-Length", "")
-    version = {
-        name: response.headers[name]
-        for name in ("ETag", "Last-Modified")
-        if response.headers.get(name)
-    }
+    version = {name: response.headers[name] for name, _ in validators if response.headers.get(name)}
     stream = unpacked(url, response)
     return stream, whole_number(length) if stream is response else None, version
 
@@ -182,9 +184,8 @@ def _open_fsspec(url: str, known_version: Version) -> Download | None:
         try:
             info = system.info(path)
         except Exception as retry_error:
-            raise OSError(
-                f"{_reason(error)}; without credentials: {_reason(retry_error)}"
-            ) from None
+            retried = _reason(retry_error)
+            raise OSError(f"{_reason(error)}; without credentials: {retried}") from None
     names = ("ETag", "etag", "LastModified", "updated", "mtime", "created", "size")
     version = {name: str(info[name]) for name in names if info.get(name) is not None}
     size = info.get("size")

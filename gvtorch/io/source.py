@@ -102,9 +102,8 @@ class VolumeSource(ABC):
     def peak_bytes(self) -> int:
         """Bytes of memory that reading a time point takes: the stored values and the result."""
         unpacked = self.times if self.whole else 1  # time points that are unpacked
-        return self.nbytes + self.nbytes // np.dtype(self.dtype).itemsize * unpacked * (
-            np.dtype(self.stored).itemsize
-        )
+        values = self.nbytes // np.dtype(self.dtype).itemsize
+        return self.nbytes + values * unpacked * np.dtype(self.stored).itemsize
 
     def size(self, axis: str) -> int:
         """Returns the size along an axis; 1 if the array lacks the axis."""
@@ -161,9 +160,7 @@ class VolumeSource(ABC):
         """Reads or maps a box of time points, (t, z, y, x, c) of `dtype`; damaged files may raise
         anything.
         """
-        spans = dict(zip("zyx", zip(low, high, strict=True), strict=True))
-        index = []
-        spans["t"] = times
+        index, spans = [], dict(zip("tzyx", (times, *zip(low, high, strict=True)), strict=True))
         for axis, size in zip(self.axes, self.shape, strict=True):
             start, stop = spans.get(axis, (0, size))
             backwards = axis in self.flips
@@ -219,11 +216,10 @@ class ArraySource(VolumeSource):
 
     def _check_size(self, size: int) -> None:
         if size < self._expected_bytes or (self.exact and size > self._expected_bytes):
-            shape = "x".join(str(n) for n in self.shape)
+            array = f"{'x'.join(map(str, self.shape))} {np.dtype(self.stored).name}"
+            actual = "more" if self.whole and size > self._expected_bytes else max(size, 0)
             raise ValueError(
-                f"{self.path}: {shape} {np.dtype(self.stored).name} takes {self._expected_bytes} "
-                "bytes, the file has "
-                f"{'more' if self.whole and size > self._expected_bytes else max(size, 0)}"
+                f"{self.path}: {array} takes {self._expected_bytes} bytes, the file has {actual}"
             )
 
 
@@ -355,9 +351,8 @@ def number_type(name: str) -> str | None:
     normalized = name.lower().replace("_", " ").replace("long long", "longlong")
     if match := _C_INTEGER.fullmatch(normalized):  # in several words
         normalized = ("u" if match["un"] else "") + (match["any"] or match["long"])
-    return _DTYPE_CODES.get(
-        normalized.removesuffix(" t") if normalized[-3:-2].isdigit() else normalized
-    )
+    has_size = normalized[-3:-2].isdigit()  # as in "uint16 t"
+    return _DTYPE_CODES.get(normalized.removesuffix(" t") if has_size else normalized)
 
 
 def check_time(context: str, time: object, times: int) -> None:

@@ -9,7 +9,6 @@ constant from the outermost centres to the faces of the box, as in pictures.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -141,11 +140,8 @@ class _Grid:
         if isinstance(source, N3Tree):
             branching, levels = source.branching, source.depth + 1
             self._bricks, self._channel = source.levels(), source.fine_channel(caller, channel)
-            width = source.bricks.channels[self._channel].width
-            label_values, is_labelled = (
-                source.labels.get(self._channel),
-                self._channel in source.labels,
-            )
+            width, labels = source.bricks.channels[self._channel].width, source.labels
+            label_values, is_labelled = labels.get(self._channel), self._channel in labels
         else:
             if channel is not None:
                 raise ValueError(f"{caller}: channel is for trees, got {channel!r}")
@@ -210,9 +206,8 @@ class _Grid:
             return True
         begin, end = ([n - self.margin for n in corner] for corner in (low, high))
         start, stop = clamped_box(begin, end, self.voxels)
-        cells = store.read_cells(
-            self.level, [n // CELL for n in start], [-(-n // CELL) for n in stop]
-        )[..., self.component]
+        first, last = [n // CELL for n in start], [-(-n // CELL) for n in stop]
+        cells = store.read_cells(self.level, first, last)[..., self.component]
         lowest, highest = cells[..., 0].min(), cells[..., 1].max()
         if self.label is not None:
             return bool(lowest <= self.label <= highest and (lowest < highest or outside))
@@ -241,19 +236,14 @@ def _surface_parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray
     """Yields new vertices, (v, 3) world x y z, and triangles that index all vertices so far. Blocks
     are visited along x, then y, then z; vertices on far faces are kept for the blocks behind them.
     """
-    spans = [
-        [(a, min(a + _BLOCK_CELLS, n - 1)) for a in range(0, n - 1, _BLOCK_CELLS)]
-        for n in grid.samples
-    ]
-    counts = [len(axis_spans) for axis_spans in spans]
+    last_cells = [n - 1 for n in grid.samples]
+    counts = [-(-n // _BLOCK_CELLS) for n in last_cells]
     total, vertices = int(np.prod(counts)), 0
     # By block, until the one behind it along z is done.
     far_vertices: dict[tuple[int, ...], Numbered] = {}
-    blocks = itertools.product(*(enumerate(axis_spans) for axis_spans in spans))
-    for blocks_done, block in enumerate(blocks):
-        block_index, low, high = (
-            tuple(part) for part in zip(*((n, *span) for n, span in block), strict=True)
-        )
+    for blocks_done, block_index in enumerate(np.ndindex(*counts)):
+        low = tuple(_BLOCK_CELLS * n for n in block_index)
+        high = tuple(min(a + _BLOCK_CELLS, n) for a, n in zip(low, last_cells, strict=True))
         z, y, x = block_index
         neighbours = [
             far_vertices.get(index) for index in ((z, y, x - 1), (z, y - 1, x), (z - 1, y, x))

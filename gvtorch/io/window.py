@@ -51,11 +51,11 @@ def window(
     """
     check.instance("window", "data", data, Volume, Store)
     if percent is not None:
-        if not isinstance(percent, (tuple, list)) or len(percent) != 2:
-            raise ValueError(f"window: percent must be a low and a high one, got {percent!r}")
-        low, high = (check.number("window", "percent", p, low=0, high=100) for p in percent)
+        is_pair = isinstance(percent, (tuple, list)) and len(percent) == 2
+        ends = percent if is_pair else (0, 0)
+        low, high = (check.number("window", "percent", p, low=0, high=100) for p in ends)
         if low >= high:
-            raise ValueError(f"window: percent must be a low and a high one, got {percent}")
+            raise ValueError(f"window: percent must be a low and a high one, got {percent!r}")
     check.integer("window", "component", component, low=0, high=data.width - 1)
     values = sample_values(data)[..., component].ravel()
     if percent is not None:
@@ -107,10 +107,9 @@ def sample_values(data: Volume | Store) -> np.ndarray:
             values = pool_mean(values, 2)
         return values
     sizes = [data.level_extent(level)[::-1] for level in range(data.levels)]
-    level = next(
-        (n for n, size in enumerate(sizes) if np.prod(size) <= _SAMPLE_VOXELS), data.levels - 1
-    )
-    level = data.stored_level(level)  # others would be averaged from all of a finer level
+    fitting = (level for level, size in enumerate(sizes) if np.prod(size) <= _SAMPLE_VOXELS)
+    # Others than stored levels would be averaged from all of a finer level.
+    level = data.stored_level(next(fitting, data.levels - 1))
     parts = [data.read_region(level, *box) for box in _boxes(sizes[level])]
     return np.concatenate([part.reshape(-1, data.width) for part in parts])
 
@@ -125,9 +124,8 @@ def _boxes(size: Zyx) -> list[tuple[Zyx, Zyx]]:
         side = max(1, int(n * fraction / _BOXES_PER_AXIS))
         middles = [(2 * i + 1) * n // (2 * _BOXES_PER_AXIS) for i in range(_BOXES_PER_AXIS)]
         spans.append([(max(0, m - side // 2), max(0, m - side // 2) + side) for m in middles])
-    return [
-        (tuple(a for a, _ in box), tuple(b for _, b in box)) for box in itertools.product(*spans)
-    ]
+    corners = (zip(*box, strict=True) for box in itertools.product(*spans))
+    return [(low, high) for low, high in corners]
 
 
 def _background(values: np.ndarray) -> float | None:

@@ -133,17 +133,13 @@ def _read_metadata(xml: str, width: int, colors: int, stored: str) -> FileMetada
 
 def _channel(element: Any, display: Any, stored: str) -> ChannelInfo:
     """Returns name, colour, window of a channel; Low and High are shares of the dtype's maximum."""
-    hex_color = (
-        (None if display is None else display.findtext("Color")) or element.findtext("Color") or ""
-    )
+    shown = (lambda name: None) if display is None else display.findtext
+    hex_color = shown("Color") or element.findtext("Color") or ""
     color: Rgb | None = None
     if len(hex_color) in (7, 9) and hex_color.startswith("#"):
         color = from_hex(hex_color[-6:])
     window = None
-    limits = [
-        finite_number(None if display is None else display.findtext(name))
-        for name in ("Low", "High")
-    ]
+    limits = [finite_number(shown(name)) for name in ("Low", "High")]
     if None not in limits and stored != "f4":
         max_value = float(np.iinfo(stored).max)
         low, high = (float(end or 0.0) * max_value for end in limits)

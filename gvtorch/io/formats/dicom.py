@@ -108,11 +108,8 @@ def _files(folder: str) -> Iterator[str]:
             if visited > _MAX_FILES:
                 raise ValueError(f"{folder}: more than {_MAX_FILES} files")
             file = os.path.join(subfolder, name)
-            if (
-                not name.lower().endswith(_SKIPPED_ENDINGS)
-                and name.upper() != "DICOMDIR"
-                and _has_magic(file)
-            ):
+            is_other = name.lower().endswith(_SKIPPED_ENDINGS) or name.upper() == "DICOMDIR"
+            if not is_other and _has_magic(file):
                 yield file
 
 

@@ -29,6 +29,7 @@ from .format import Format
 
 _TIFF_ENDINGS = (".tif", ".tiff")
 _CODECS = {".png": "png", ".jpg": "jpeg8", ".jpeg": "jpeg8", ".bmp": "bmp"}
+_KINDS = _CODECS | dict.fromkeys(_TIFF_ENDINGS, "tiff")
 _HEADER_BYTES = 1 << 20  # at the start of an image that hold its header
 _MAX_PIXELS = 2**31
 
@@ -61,13 +62,9 @@ def _slices(path: str) -> list[Path]:
     """Returns the images in a folder; raises ValueError if they are of several kinds."""
     files: dict[str, list[Path]] = {}
     for file in Path(path).iterdir():
-        ending = file.suffix.lower()
-        if (
-            ending in (*_TIFF_ENDINGS, *_CODECS)
-            and not file.name.startswith(".")
-            and file.is_file()
-        ):
-            files.setdefault(_CODECS.get(ending, "tiff"), []).append(file)
+        kind = _KINDS.get(file.suffix.lower())
+        if kind and not file.name.startswith(".") and file.is_file():
+            files.setdefault(kind, []).append(file)
     if len(files) > 1:
         kinds = " and ".join(f"{len(group)} {kind}" for kind, group in sorted(files.items()))
         raise ValueError(f"{path}: images of several kinds: {kinds}; expected those of one stack")

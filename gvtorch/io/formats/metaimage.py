@@ -59,7 +59,7 @@ def open_metaimage(path: str) -> VolumeSource:
         "dropped": tuple(dropped),
         **_placement(path, header, shape, width),
     }
-    data_name = header["ElementDataFile"].strip()
+    data_name = header["ElementDataFile"]
     if data_name.upper() == "LIST" or "%" in data_name:
         raise ValueError(
             f"{path}: its slices are in separate files (ElementDataFile = {data_name})"

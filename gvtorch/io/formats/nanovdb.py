@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..packed import blosc_begin, unpack_block
-from ..sparse_grid import COUNTS, VOXELS, SparseGrid, SparseSource, bits, check_roots
+from ..sparse_grid import COUNTS, SIDES, VOXELS, SparseGrid, SparseSource, bits, check_roots
 from .format import Format, choose
 
 _FILE_MAGICS = (b"NanoVDB0", b"NanoVDB2")
@@ -219,22 +219,14 @@ class NodeFormat(NamedTuple):
 
         def behind(start: int, value_count: int) -> int:
             """Returns the offset behind values, mean and deviation, a multiple of 32 bytes."""
-            return _round_up(
-                _round_up(_round_up(start, item_bytes) + value_count * value_bytes, mean_bytes)
-                + 2 * mean_bytes,
-                _ALIGNMENT,
-            )
+            end = _round_up(start, item_bytes) + value_count * value_bytes
+            return _round_up(_round_up(end, mean_bytes) + 2 * mean_bytes, _ALIGNMENT)
 
         value_offset = _round_up(20, item_bytes)
-        fixed_bytes = {"Mask": 0, "bool": 64, "FpN": 0}
-        voxel_bytes = (
-            64 * _CODE_BITS[kind]
-            if kind in _CODE_BITS
-            else fixed_bytes.get(kind, VOXELS * value_bytes)
-        )
-        voxels_start = (
-            16 if kind == "Mask" else 96 if kind in _CODE_BITS or kind == "FpN" else behind(80, 2)
-        )
+        coded_bytes = {name: 64 * code_bits for name, code_bits in _CODE_BITS.items()} | {"FpN": 0}
+        fixed_bytes = coded_bytes | {"Mask": 0, "bool": 64}
+        voxel_bytes = fixed_bytes.get(kind, VOXELS * value_bytes)
+        voxels_start = 16 if kind == "Mask" else 96 if kind in coded_bytes else behind(80, 2)
         return cls(
             tiles_start=behind(28, 3),
             tile_size=_round_up(value_offset + value_bytes, _ALIGNMENT),
@@ -276,11 +268,8 @@ class NanoGrid(SparseGrid):
             raise ValueError("a key of the root is not a voxel's position")
         corners = (keys.astype(np.int64) << 44 >> 44) * 4096  # 20 bits, signed
         has_child = root_table["child"] != 0
-        node_offsets = [
-            _checked_offsets(
-                _ROOT_OFFSET + root_table["child"][has_child], len(data), layout.entries_start[0]
-            )
-        ]
+        child_offsets = _ROOT_OFFSET + root_table["child"][has_child]
+        node_offsets = [_checked_offsets(child_offsets, len(data), layout.entries_start[0])]
         origins = [corners[has_child]]
         for level in (0, 1):
             node_bytes = layout.entries_start[1] if level == 0 else layout.leaf_size
@@ -295,10 +284,8 @@ class NanoGrid(SparseGrid):
             layout.leaf_size,
         )
         _check_apart(node_offsets, sizes)
-        counts, declared = (
-            [len(part) for part in node_offsets],
-            struct.unpack_from("<3I", data, _COUNTS_OFFSET),
-        )
+        counts = [len(part) for part in node_offsets]
+        declared = struct.unpack_from("<3I", data, _COUNTS_OFFSET)
         if counts != [*declared[::-1]]:
             raise ValueError(
                 f"the tree has {counts[::-1]} nodes, leaves first; it declares {declared}"
@@ -354,14 +341,13 @@ def _children(
     data: Any, layout: NodeFormat, level: int, node_offsets: np.ndarray, origins: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yields for each node the offsets of its children, and their first voxels."""
-    n, side = COUNTS[level], COUNTS[level + 1] * (8 if level == 0 else 1)
+    n, strides = COUNTS[level], (layout.entry_size,)
     for offset, origin in zip(node_offsets.tolist(), origins, strict=True):
-        child_entries = np.flatnonzero(bits(data, offset + 32 + n**3 // 8, n**3))
-        child_steps = np.ndarray(
-            (n**3,), "<i8", data, offset + layout.entries_start[level], (layout.entry_size,)
-        )
-        entry_positions = np.stack(np.unravel_index(child_entries, (n, n, n)), 1)
-        yield offset + child_steps[child_entries], origin + entry_positions * side
+        is_child = bits(data, offset + 32 + n**3 // 8, n**3)
+        steps_start = offset + layout.entries_start[level]
+        child_steps = np.ndarray((n**3,), "<i8", data, steps_start, strides)
+        positions = np.argwhere(is_child.reshape(n, n, n)) * SIDES[level + 1]
+        yield offset + child_steps[is_child], origin + positions
 
 
 def _checked_offsets(offsets: np.ndarray, size: int, node_bytes: int) -> np.ndarray:

@@ -45,9 +45,7 @@ def open_nd2(path: str, key: str | None = None) -> Nd2Source:
 
     with nd2.ND2File(path) as file:
         sizes: Mapping[str, int] = dict(file.sizes)
-        extra_axes = {
-            axis: size for axis, size in sizes.items() if axis not in "TPZCYXS" and size > 1
-        }
+        extra_axes = {a: size for a, size in sizes.items() if a not in "TPZCYXS" and size > 1}
         if extra_axes:
             raise ValueError(f"{path}: has axes other than T, P, Z, C, Y, X: {extra_axes}")
         position, others = choose(path, "position", range(sizes.get("P", 1)), key)
@@ -82,14 +80,8 @@ def _read_metadata(file: Any, sizes: Mapping[str, int]) -> FileMetadata:
         channels.append(ChannelInfo(name=channel.channel.name or "", color=color))
     if sizes.get("S", 1) == 3:
         channels = [*color_channels()]
-    step = next(
-        (
-            float(loop.parameters.periodMs)
-            for loop in file.experiment
-            if loop.type == "TimeLoop" and loop.parameters.periodMs > 0
-        ),
-        None,
-    )
+    periods = (loop.parameters.periodMs for loop in file.experiment if loop.type == "TimeLoop")
+    step = next((float(period) for period in periods if period > 0), None)
     width = sizes.get("C", 1) * sizes.get("S", 1)
     dropped = ["regions of interest (ROI)"] if getattr(file, "rois", None) else []
     return microscope_info(unit, channels, width, step, "millisecond"), spacing, dropped

@@ -45,27 +45,17 @@ def open_nifti(path: str) -> NiftiSource:
     image, corrections = _load(path)
     shape = tuple(int(n) for n in image.shape)
     packed = path.lower().endswith(".gz")
-    needed_bytes, file_bytes = (
-        math.prod(shape) * image.dataobj.dtype.itemsize,
-        os.stat(path).st_size,
-    )
-    if (
-        packed and needed_bytes > MAX_UNPACK_RATIO * file_bytes
-    ):  # nibabel allocates memory for all of it at once
-        raise ValueError(f"{path}: takes {needed_bytes} bytes, which {file_bytes} can't unpack to")
+    needed_bytes, size = math.prod(shape) * image.dataobj.dtype.itemsize, os.stat(path).st_size
+    if packed and needed_bytes > MAX_UNPACK_RATIO * size:  # nibabel allocates all of it at once
+        raise ValueError(f"{path}: takes {needed_bytes} bytes, which {size} can't unpack to")
     first_voxel = np.asanyarray(image.dataobj[(slice(0, 1),) * len(shape)])
     if first_voxel.dtype.fields is not None:  # colours: a structured dtype of components
         first_voxel = _components(first_voxel)
         shape = (*shape, *[1] * (4 - len(shape)), first_voxel.shape[-1])
     if len(shape) < 3 or math.prod(shape[5:]) != 1:
         raise ValueError(f"{path}: expected 3 to 5 dimensions, got {shape}")
-    placement = place_axes(
-        path,
-        np.asarray(image.affine),
-        shape[:5],
-        4 if len(shape) > 4 else None,
-        3 if len(shape) > 3 else None,
-    )
+    component, time = (axis if len(shape) > axis else None for axis in (4, 3))
+    placement = place_axes(path, np.asarray(image.affine), shape[:5], component, time)
     info, dropped = _info(image, shape)
     return NiftiSource(
         path=path,

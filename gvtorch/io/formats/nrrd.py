@@ -89,9 +89,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
         raise ValueError(f"{path}: its numbers lie in several files (data file: {data_name})")
     if skip_bytes < -1 or skip_lines < 0 or (skip_bytes == -1 and encoding != "raw"):
         raise ValueError(f"{path}: byte skip {skip_bytes}, line skip {skip_lines}")
-    data_file, start = (
-        (path, offset) if data_name is None else (str(Path(path).parent / data_name), 0)
-    )
+    data_file, start = path, offset
+    if data_name is not None:
+        data_file, start = str(Path(path).parent / data_name), 0
     size = os.stat(data_file).st_size
     # Lines are skipped in the file; then bytes, in the unpacked data.
     max_skipped = size if encoding in ("raw", "text") else _MAX_SKIPPED_BYTES
@@ -134,15 +134,12 @@ def _axis_roles(path: str, header: dict[str, Any], shape: tuple[int, ...], axes:
         raise ValueError(f"{path}: expected 3 axes of space, got {rank} axes")
     if axes is None:
         if len(kinds) == rank and set(kinds) - {"???", "none"}:
-            roles = [
-                "s" if kind in _SPATIAL_KINDS else "t" if kind == "time" else "c" for kind in kinds
-            ]
+            known_roles = {**dict.fromkeys(_SPATIAL_KINDS, "s"), "time": "t"}
+            roles = [known_roles.get(kind, "c") for kind in kinds]
         else:  # axes of space are those with a direction, else those with a step
             tables = _directions(header, rank), _steps(header, rank)[0][:, None]
-            table = next(
-                (candidate for candidate in tables if np.isfinite(candidate).any()),
-                np.zeros((rank, 1)),
-            )
+            known = (candidate for candidate in tables if np.isfinite(candidate).any())
+            table = next(known, np.zeros((rank, 1)))
             roles = ["s" if np.isfinite(row[:3]).all() else "c" for row in table]
         if roles.count("s") == 3 and roles.count("t") <= 1 and roles.count("c") <= 1:
             letters = iter("xyz")

@@ -288,10 +288,9 @@ class _Packing:
         if not self.has_masks:
             return self._read(cursor, len(active))
         code = cursor.number("<B")
-        inactive_1 = self.background
-        inactive_0 = (
-            inactive_1 if code == 0 else ~inactive_1 if self.dtype.kind == "b" else -inactive_1
-        )
+        inactive_0 = inactive_1 = self.background
+        if code != 0:
+            inactive_0 = ~inactive_1 if self.dtype.kind == "b" else -inactive_1
         if code in (2, 4, 5):
             inactive_0 = cursor.array(self.dtype, self.width)
         if code == 5:
@@ -428,9 +427,7 @@ class _Topology:
         child_entries = np.flatnonzero(is_child)
         value_count = n**3 if self.packing.has_masks else n**3 - len(child_entries)
         self.packing.skip(cursor, int(np.count_nonzero(active)), value_count)
-        corners = (
-            origin + np.stack(np.unravel_index(child_entries, (n, n, n)), 1) * SIDES[level + 1]
-        )
+        corners = origin + np.argwhere(is_child.reshape(n, n, n)) * SIDES[level + 1]
         if level == 0:
             for corner in corners:
                 self._node(1, corner)

@@ -105,23 +105,14 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         shape = tuple(int(n) for n in series.shape)
         axes = _axes(path, shape, series.axes)
         info, spacing, dropped = _read_metadata(file, series, chosen, axes, shape)
-        dropped += others
-        dropped += [
-            f"what tifffile warns of ({text})" for text in dict.fromkeys(tiff_messages(log))
-        ]
-        fields: dict[str, Any] = {
-            "path": path,
-            "shape": shape,
-            "axes": axes,
-            "spacing": spacing,
-            "info": info,
-        }
+        messages = dict.fromkeys(tiff_messages(log))
+        dropped += [*others, *(f"what tifffile warns of ({text})" for text in messages)]
+        fields: dict[str, Any] = {"path": path, "shape": shape, "axes": axes, "info": info}
+        fields["spacing"] = spacing
         if series.dataoffset is not None:
+            fields |= {"dropped": tuple(dropped), "offset": int(series.dataoffset)}
             stored = series.dtype.newbyteorder(file.byteorder).str
-            offset = int(series.dataoffset)
-            return ArraySource(
-                file=path, stored=stored, offset=offset, dropped=tuple(dropped), **fields
-            )
+            return ArraySource(file=path, stored=stored, **fields)
         page_shape = tuple(series.keyframe.shape)
         leading = len(shape) - len(page_shape)
         by_page = shape[leading:] == page_shape and len(series.pages) == math.prod(shape[:leading])
@@ -168,11 +159,8 @@ def _read_metadata(
     dropped = [*photometric_dropped(series)]
     if series.kind == "imagej":
         info, spacing, also_dropped = imagej_info(file.imagej_metadata, _resolution(file), width)
-        return (
-            replace(info, channels=channels) if is_color else info,
-            spacing,
-            [*also_dropped, *dropped],
-        )
+        info = replace(info, channels=channels) if is_color else info
+        return info, spacing, [*also_dropped, *dropped]
     if others := sorted(_OTHER_METADATA & file.pages[0].flags):
         dropped.append(f"metadata of {', '.join(others)}, such as sizes of voxels")
     tags = series.keyframe.tags

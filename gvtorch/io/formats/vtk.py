@@ -334,9 +334,8 @@ def _legacy_parts(
             len(tokens) == 4 and _legacy_type(tokens[3]) and field_arrays_left > 0
         ):
             array = _legacy_array(path, tokens, points, cells)
-            lookup_table = re.match(
-                rb"(?i)LOOKUP_TABLE[^\n]*\n", content[position : position + 200]
-            )
+            next_line = content[position : position + 200]
+            lookup_table = re.match(rb"(?i)LOOKUP_TABLE[^\n]*\n", next_line)
             position += lookup_table.end() if lookup_table and name == "SCALARS" else 0
             arrays.append({**array, "offset": position})
             field_arrays_left -= name not in _ARRAY_KEYWORDS

@@ -72,11 +72,11 @@ class BlockReader:
         shard = zyx // (layout.shard // layout.block)
         order = np.lexsort((*zyx.T[::-1], *shard.T[::-1]))
         errors = self._read_chunks(self._blocks[level], level, zyx, order, out, deadline)
-        for shard_index in np.unique(shard, axis=0):
+        for shard_index, rows in zip(*group_rows(shard), strict=True):
             try:
                 self._checksums.check(layout.blocks(level), tuple(shard_index.tolist()), deadline)
             except (StoreError, ValueError) as error:
-                for row in np.flatnonzero((shard == shard_index).all(1)).tolist():
+                for row in rows.tolist():
                     out[row] = 0
                     errors.setdefault(row, block_error(self.location, level, zyx[row], error))
         for row in _zero_rows(out):
@@ -156,11 +156,9 @@ class BlockReader:
         """Fills a block that was read as all zeros, so may not be stored, with its values from
         cells or pyramid; raises StoreError if it should have been stored.
         """
-        cells_per_block = self._layout.block // CELL
-        high = np.minimum((block_index + 1) * cells_per_block, self._layout.grid(level, CELL))
-        cells = self.read_cells(
-            level, (block_index * cells_per_block).tolist(), high.tolist(), deadline
-        )
+        low = block_index * (self._layout.block // CELL)
+        high = np.minimum(low + self._layout.block // CELL, self._layout.grid(level, CELL))
+        cells = self.read_cells(level, low.tolist(), high.tolist(), deadline)
         if (cells == cells[:1, :1, :1, :1]).all():
             block[:] = cells[0, 0, 0, 0]
             return
@@ -222,13 +220,12 @@ def cut_blocks(
         except StoreError as error:
             if len(rows) == 1:
                 errors[int(rows[0])] = block_error(location, level, zyx[rows[0]], error)
-                return
-            for i in rows:
+            for i in rows if len(rows) > 1 else ():
                 read(np.array([i]))
             return
         for i in rows:
-            z, y, x = zyx[i] * block - BORDER - low
-            out[i] = data[z : z + side, y : y + side, x : x + side]
+            corner = zyx[i] * block - BORDER - low
+            out[i] = data[boxes.index(corner, corner + side)]
 
     with ThreadPoolExecutor(_READER_THREADS) as threads:
         for _ in threads.map(read, _group_blocks(zyx, side)):
@@ -274,9 +271,7 @@ def _group_blocks(zyx: np.ndarray, side: int) -> list[np.ndarray]:
     """Returns groups of indices of blocks, each to be read as one region."""
     groups = []
     for rows in group_rows(zyx // _GROUP_BLOCKS)[1]:
-        extent = (zyx[rows].max(0) - zyx[rows].min(0) + 1) * (side - 2 * BORDER) + 2 * BORDER
-        if math.prod(extent.tolist()) <= 2 * len(rows) * side**3:
-            groups.append(rows)
-        else:
-            groups += [np.array([i]) for i in rows]
+        extent = (np.ptp(zyx[rows], axis=0) + 1) * (side - 2 * BORDER) + 2 * BORDER
+        is_dense = math.prod(extent.tolist()) <= 2 * len(rows) * side**3
+        groups += [rows] if is_dense else [np.array([i]) for i in rows]
     return groups

@@ -86,9 +86,8 @@ def make_channel(
         channels = CoarseChannel.parse(str(file), attributes)
         previous = channels.get(name)
         new_channel = replace(channel, generation=previous.generation + 1 if previous else 0)
-        _write_blocks(
-            store, new_channel.folder(name), new_channel.width, levels, to_values, progress
-        )
+        channel_folder = new_channel.folder(name)
+        _write_blocks(store, channel_folder, new_channel.width, levels, to_values, progress)
         channels[name] = new_channel
         entries = {key: entry.attributes() for key, entry in channels.items()}
         write_json(file, group_metadata({"channels": entries}))
@@ -122,10 +121,8 @@ def _map_level_file(store: Store, folder: Path, level: int, fill_width: int) -> 
             os.posix_fallocate(handle.fileno(), 0, file.stat().st_size)
         except OSError as error:
             sizes = [math.prod(store.level_extent(other)) for other in range(1, store.levels)]
-            reason = (
-                f"{error.strerror}: while it is made, files take "
-                f"{amount(2 * fill_width * sum(sizes))}"
-            )
+            needed = amount(2 * fill_width * sum(sizes))
+            reason = f"{error.strerror}: while it is made, files take {needed}"
             raise OSError(error.errno, reason, store.location) from None
     return mapped
 
@@ -165,10 +162,9 @@ def _blocks(
     to_values: Callable[[np.ndarray], np.ndarray],
 ) -> np.ndarray:
     """Returns (gz, gy, gx, s, s, s, c) blocks of a cube of a level, borders included."""
-    begin = [a - BORDER for a in low]
-    end = [
-        a + -(-n // layout.block) * layout.block + BORDER for a, n in zip(low, size, strict=True)
-    ]
+    padded_size = np.multiply(-(-np.array(size) // layout.block), layout.block)
+    begin = np.subtract(low, BORDER).tolist()
+    end = (low + padded_size + BORDER).tolist()
     start, stop = boxes.clamped_box(begin, end, values.shape[:3])
     padded = boxes.repeat_edges(to_values(values[boxes.index(start, stop)]), start, begin, end)
     return np.ascontiguousarray(bordered(layout, padded))

@@ -173,7 +173,10 @@ def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: P
             with durable_file(plan.target / WORK / LABELS) as file:
                 write_npy(file, plan.labels)
         with _open_executor(executor, plan) as pool:
-            _write_levels(_stage_source(plan, pool), unfinished_store, pool, progress)
+            if not isinstance(pool, ThreadPoolExecutor):  # other processes have to read the source
+                source = task.source.staged(plan.target / WORK)
+                task = dataclasses.replace(task, source=source)
+            _write_levels(plan, task, unfinished_store, pool, progress)
         if plan.labels is not None:
             shard.write_label_array(task, plan.labels)
         layout = dataclasses.replace(task.layout, value_range=_value_range(task))
@@ -207,35 +210,27 @@ def _explain_resume(plan: Plan) -> Iterator[None]:
         ) from None
 
 
-def _stage_source(plan: Plan, pool: Executor) -> Plan:
-    """Writes a source in memory to files, if other processes have to read it."""
-    if isinstance(pool, ThreadPoolExecutor):
-        return plan
-    source = plan.task.source.staged(plan.target / WORK)
-    return dataclasses.replace(plan, task=dataclasses.replace(plan.task, source=source))
-
-
 def _write_levels(
-    plan: Plan, unfinished_store: unfinished.UnfinishedStore, pool: Executor, progress: Progress
+    plan: Plan,
+    task: shard.Conversion,
+    unfinished_store: unfinished.UnfinishedStore,
+    pool: Executor,
+    progress: Progress,
 ) -> None:
-    layout = plan.task.layout
+    layout = task.layout
     total = layout.voxels * layout.voxel_bytes
     done = sum(finished.voxels for finished in unfinished_store.done.values()) * layout.voxel_bytes
     progress("converting", done, total)
     knows_workers = isinstance(pool, (ProcessPoolExecutor, ThreadPoolExecutor))
     ahead = 2 * plan.workers + 2 if knows_workers else _TASKS_AHEAD
     for level in range(layout.levels):
-        indices = [
-            index
-            for index in layout.shard_indices(level)
-            if (level, *index) not in unfinished_store.done
-        ]
+        tasks, done_tasks = layout.shard_indices(level), unfinished_store.done
+        indices = [index for index in tasks if (level, *index) not in done_tasks]
         if not indices:
             continue
-        shard.create_arrays(plan.task, level)
-        bad_values = 0
-        task = partial(shard.write_shard, plan.task, level)
-        with closing(resources.run_ahead(pool, task, indices, ahead)) as results:
+        shard.create_arrays(task, level)
+        bad_values, write = 0, partial(shard.write_shard, task, level)
+        with closing(resources.run_ahead(pool, write, indices, ahead)) as results:
             for result in results:
                 bad_values += result.bad_values
                 if not result.bad_values:
@@ -249,9 +244,8 @@ def _write_levels(
                 f"{layout.times * math.prod(layout.extent) * layout.width}); pass nan=VALUE "
                 "(--nan VALUE) to replace them"
             )
-        for bound in ("low", "high"):  # bounds of the level below are no longer needed
-            folder = plan.target / WORK / bound / str(level - 1)
-            shutil.rmtree(folder, ignore_errors=True)
+        for spec in layout.bounds(level - 1):  # those of the level below are no longer needed
+            shutil.rmtree(plan.target / spec["path"], ignore_errors=True)
 
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:

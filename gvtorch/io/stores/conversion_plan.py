@@ -141,9 +141,8 @@ def plan_of(
     if threshold is not None:
         threshold = check.number("convert", "threshold", threshold)
     if nan is not None:
-        limit = (
-            float(np.finfo(source.dtype).max) if np.dtype(source.dtype).kind == "f" else math.inf
-        )
+        is_float = np.dtype(source.dtype).kind == "f"
+        limit = float(np.finfo(source.dtype).max) if is_float else math.inf
         nan = check.number("convert", "nan", nan, low=-limit, high=limit)
     if source.info.labels and threshold is not None:
         raise ValueError("convert: threshold is for values; labels are hidden by the shader")
@@ -200,7 +199,7 @@ def estimate_of(plan: Plan) -> Estimate:
     scale = (voxels + coarse_voxels) / sampled_voxels
     worker_bytes, source_bytes = _task_bytes(plan)
     staged_bytes = source_bytes if plan.uses_processes else 0
-    start_seconds = 3.0 * plan.uses_processes
+    cost, start_seconds = voxels + _COARSE_COST * coarse_voxels, 3.0 * plan.uses_processes
     target = plan.target.absolute()
     folder = next(path for path in (target, *target.parents) if path.exists())
     return Estimate(
@@ -213,12 +212,7 @@ def estimate_of(plan: Plan) -> Estimate:
         disk_bytes=int((pyramid_bytes + other_bytes) * scale),
         temporary_bytes=int(2 * pyramid_bytes * coarse_voxels / sampled_voxels) + staged_bytes,
         memory_bytes=_PROCESS_BYTES + plan.workers * worker_bytes + source_bytes,
-        seconds=_DISK_FACTOR
-        * seconds
-        * (voxels + _COARSE_COST * coarse_voxels)
-        / sampled_voxels
-        / plan.workers
-        + start_seconds,
+        seconds=_DISK_FACTOR * seconds * cost / sampled_voxels / plan.workers + start_seconds,
         workers=plan.workers,
         disk_free=shutil.disk_usage(folder).free,
         memory_free=resources.memory_free() + source_bytes,
@@ -243,11 +237,10 @@ def fit_workers(plan: Plan, memory: int | str | None) -> Plan:
     limit = free if memory is None else check.nbytes("convert", "memory", memory)
     fitting = (limit - _PROCESS_BYTES - source_bytes) // worker_bytes
     if fitting < 1 and memory is not None:
-        limit_text, needed_text = (
-            resources.amount(n) for n in (limit, _PROCESS_BYTES + source_bytes + worker_bytes)
-        )
+        needed = resources.amount(_PROCESS_BYTES + source_bytes + worker_bytes)
         raise ValueError(
-            f"{plan.target}: memory of {limit_text} is too little, one worker takes {needed_text}"
+            f"{plan.target}: memory of {resources.amount(limit)} is too little, one worker takes "
+            f"{needed}"
         )
     return dataclasses.replace(plan, workers=max(1, min(plan.workers, fitting)))
 
@@ -258,15 +251,13 @@ def _sample(task: shard.Conversion) -> tuple[int, int, int, float]:
 
     layout = task.layout
     indices = list(layout.shard_indices(0))  # the picks are spread over space and time
-    sampled = [
-        indices[(2 * i + 1) * len(indices) // (2 * _SAMPLE_CUBES)] for i in range(_SAMPLE_CUBES)
-    ]
+    middles = [(2 * i + 1) * len(indices) // (2 * _SAMPLE_CUBES) for i in range(_SAMPLE_CUBES)]
     root = {"driver": "memory", "path": f"gvtorch-estimate-{id(task)}/"}
     store = ts.KvStore.open(root, context=context()).result()
     trial = dataclasses.replace(task, root=root, nan=0.0 if task.nan is None else task.nan)
     shard.create_arrays(trial, 0)
     start, voxels = perf_counter(), 0
-    for index in dict.fromkeys(sampled):
+    for index in dict.fromkeys(indices[middle] for middle in middles):
         voxels += shard.write_shard(trial, 0, index).voxels
         if perf_counter() - start > _SAMPLE_SECONDS:
             break

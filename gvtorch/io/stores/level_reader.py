@@ -186,13 +186,9 @@ class LevelReader:
             candidates = [s for s in stored if all(2**level % f == 0 for f in s.factors)]
             base = max(candidates, key=lambda s: math.prod(s.factors))
             remaining = [2**level // f for f in base.factors]  # factors that remain to be averaged
-            direct = math.prod(remaining)
-            if level == 0 or direct < 8 * cost:
-                self._plans.append((base, remaining))
-                cost = direct
-            else:
-                self._plans.append(None)
-                cost *= 8
+            is_direct = level == 0 or math.prod(remaining) < 8 * cost
+            self._plans.append((base, remaining) if is_direct else None)
+            cost = math.prod(remaining) if is_direct else 8 * cost
         self._tiles: OrderedDict[tuple[int, ...], np.ndarray] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -204,10 +200,8 @@ class LevelReader:
 
     def coarsest(self, level: int) -> int:
         """Returns the coarsest level up to `level` that is read without averaging finer ones."""
-        stored_levels = [
-            n for n, plan in enumerate(self._plans[: level + 1]) if plan and max(plan[1]) == 1
-        ]
-        return stored_levels[-1]
+        plans = enumerate(self._plans[: level + 1])
+        return [n for n, plan in plans if plan and max(plan[1]) == 1][-1]
 
     def _read_inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]

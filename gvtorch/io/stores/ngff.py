@@ -256,7 +256,7 @@ def _label_notes(location: str, root: Any, deadline: Deadline) -> list[str]:
     labels = _ngff_attribute(group, "labels")
     if not isinstance(labels, list) or not labels:
         return []
-    return [f"the labels {', '.join(f'labels/{name}' for name in labels[:5])}"]
+    return [f"the labels {_join_some([f'labels/{name}' for name in labels])}"]
 
 
 def _stored_info(stored: Any, info: ImageInfo) -> ImageInfo:

@@ -121,11 +121,8 @@ def _pool_finer_level(
     start, stop = boxes.clamped_box(low, high, layout.shape(level))
     size = (*[b - a for a, b in zip(start, stop, strict=True)], layout.width)
     pooled = [np.empty(size, layout.dtype) for _ in pools]
-    for z in (
-        start[0],
-        *range((start[0] // _SLAB_PLANES + 1) * _SLAB_PLANES, stop[0], _SLAB_PLANES),
-    ):
-        end = min(stop[0], (z // _SLAB_PLANES + 1) * _SLAB_PLANES)
+    for slab in range(start[0] // _SLAB_PLANES, -(-stop[0] // _SLAB_PLANES)):
+        z, end = max(start[0], slab * _SLAB_PLANES), min(stop[0], (slab + 1) * _SLAB_PLANES)
         first = [2 * z, 2 * start[1], 2 * start[2]]
         last = np.minimum([2 * end, 2 * stop[1], 2 * stop[2]], layout.shape(level - 1)).tolist()
         parts = [array.read(first, last, deadline) for array in arrays]

@@ -89,9 +89,7 @@ class Store:
         differs = (layout.extent, layout.dtype) != ((x, y, z), dtype)
         if differs or (own_layout and own_layout.times != self.times):
             raise ValueError(f"{context}: damaged: metadata and level 0 differ in extent or dtype")
-        label_values = (
-            None if layout.label_count is None else _read_labels(context, root, layout, deadline)
-        )
+        label_values = _read_labels(context, root, layout, deadline)
         self.label_values = None if label_values is None else torch.from_numpy(label_values)
         self.pool = pool_of(pyramid.info, label_values)
         self._levels = LevelReader(arrays, layout, self.pool)
@@ -331,8 +329,12 @@ class Store:
         return check.integer(self.location, "level", level, low=0, high=self.levels - 1)
 
 
-def _read_labels(location: str, root: Any, layout: StoreLayout, deadline: Deadline) -> np.ndarray:
-    """Returns (k,) int64 the table of indexed labels."""
+def _read_labels(
+    location: str, root: Any, layout: StoreLayout, deadline: Deadline
+) -> np.ndarray | None:
+    """Returns (k,) int64 the table of indexed labels; None if labels are not indexed."""
+    if layout.label_count is None:
+        return None
     spec = layout.labels()
     context = f"{location}/{spec['path']}"
     chunked = wait_for_array(location, spec, begin_open(root, spec), deadline)
@@ -343,6 +345,5 @@ def _read_labels(location: str, root: Any, layout: StoreLayout, deadline: Deadli
 
 
 def _check_box(low: Zyx, high: Zyx) -> None:
-    is_valid = len(low) == len(high) == 3 and all(a < b for a, b in zip(low, high, strict=True))
-    if not is_valid:
+    if not len(low) == len(high) == 3 or any(a >= b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"low and high must be (z, y, x) with low < high, got {low} and {high}")

@@ -20,6 +20,7 @@ import numpy as np
 from ...base.image_info import ImageInfo
 from ...base.volume import Volume, movable
 from ...base.whole_file import durable_file, name_in_errors, rename
+from ..remote import content_version
 from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
 from .ngff import image_metadata, read_json_file
 from .store_layout import GROUPS, JOURNAL, MANIFEST, WORK, StoreLayout
@@ -254,7 +255,8 @@ def checksum(arrays: Iterable[np.ndarray]) -> int:
 
 
 def fingerprint(source: str | Path | Volume, target: Path | None = None) -> list[Any]:
-    """Returns a source's sizes and modification times, or a checksum: equal while unchanged.
+    """Returns a source's sizes and modification times, or a checksum, or what identifies the
+    version of a file that was downloaded: equal while unchanged.
     `target`, a store that may lie in a source's folder, does not count.
     """
     if isinstance(source, Volume):
@@ -264,6 +266,8 @@ def fingerprint(source: str | Path | Volume, target: Path | None = None) -> list
     if "://" in text:
         return [text]
     path = Path(text)
+    if (version := content_version(path)) is not None:
+        return [version]
     if not path.is_dir():
         stat = path.stat()
         return [stat.st_size, stat.st_mtime_ns]
