@@ -121,12 +121,12 @@ def server(tmp_path, monkeypatch) -> Iterator[Server]:
 def mended(server: Server, read: Callable[[], Any]) -> Any:
     """Returns what a read gives once the server works again and its failure is forgotten."""
     server.bad = ""
-    for _ in range(40):
+    for _ in range(400):
         http.retry_refused()
         try:
             return read()
         except OSError:
-            time.sleep(0.5)  # until pending requests have ended
+            time.sleep(0.05)  # until pending requests have ended
     return read()
 
 
