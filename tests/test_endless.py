@@ -109,6 +109,8 @@ def server(tmp_path, monkeypatch) -> Iterator[Server]:
     monkeypatch.setattr(http, "STALL_SECONDS", 1.5)
     monkeypatch.setattr(http, "MIN_BYTES_PER_SECOND", 10**7)
     monkeypatch.setattr(http, "REFUSED_SECONDS", 60.0)
+    delays = {"initial_delay": "20ms", "max_delay": "100ms"}
+    monkeypatch.setattr(relay, "_RETRIES", relay._RETRIES | delays)
     with Server(tmp_path) as running:
         thread = threading.Thread(target=running.serve_forever)
         thread.start()
