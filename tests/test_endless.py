@@ -109,6 +109,8 @@ def server(tmp_path, monkeypatch) -> Iterator[Server]:
     monkeypatch.setattr(http, "STALL_SECONDS", 1.5)
     monkeypatch.setattr(http, "MIN_BYTES_PER_SECOND", 10**7)
     monkeypatch.setattr(http, "REFUSED_SECONDS", 60.0)
+    delays = {"initial_delay": "20ms", "max_delay": "100ms"}
+    monkeypatch.setattr(relay, "_RETRIES", relay._RETRIES | delays)
     with Server(tmp_path) as running:
         thread = threading.Thread(target=running.serve_forever)
         thread.start()
@@ -121,12 +123,12 @@ def server(tmp_path, monkeypatch) -> Iterator[Server]:
 def mended(server: Server, read: Callable[[], Any]) -> Any:
     """Returns what a read gives once the server works again and its failure is forgotten."""
     server.bad = ""
-    for _ in range(40):
+    for _ in range(400):
         http.retry_refused()
         try:
             return read()
         except OSError:
-            time.sleep(0.5)  # until pending requests have ended
+            time.sleep(0.05)  # until pending requests have ended
     return read()
 
 
