@@ -15,6 +15,7 @@ VENV := .venv
 COMMA := ,
 SOURCES := $(wildcard gvtorch/cpp_ext/csrc/*.* gvtorch/cpp_ext/csrc/*/*)
 BIN := $(VENV)/bin
+PACKETS := gvtorch/cpp_ext/lib/packet.baseline.o
 TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
 NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
 # A development build compiles CUDA for the cards that are here; without one, for one architecture, to see it compile.
@@ -89,7 +90,7 @@ bench: $(VENV)/bench
 	for device in cpu $(if $(NATIVE),cuda); do $(BIN)/gvtorch bench all --device $$device -o docs/performance $(ARGS) || exit; done
 	$(BIN)/python benchmarks/plots.py
 
-# Without GVTORCH_CUDA_ARCHS, for all architectures that build.py names. auditwheel finds the oldest glibc that has what
+# Without GVTORCH_CUDA_ARCHS, for all architectures that libraries.py names. auditwheel finds the oldest glibc that has what
 # the libraries use, and names it in the tag; torch's own libraries are those of the torch that is installed.
 wheel: export GVTORCH_CUDA_ARCHS := $(ARCHS_GIVEN)
 wheel: $(VENV)/ready
@@ -113,8 +114,13 @@ $(VENV)/packages: $(VENV)/torch
 	GVTORCH_COMPILE=0 $(PIP) --no-build-isolation -e ".[dev]"
 	@touch $@
 
-$(VENV)/libraries: $(VENV)/torch $(SOURCES) gvtorch/cpp_ext/build.py gvtorch/cpp_ext/compilers.py
-	$(BIN)/python gvtorch/cpp_ext/build.py
+# Packets need nothing of torch, so that make -j compiles them while it is installed.
+$(PACKETS): $(SOURCES) gvtorch/cpp_ext/libraries.py gvtorch/cpp_ext/compilers.py
+	$(PYTHON) gvtorch/cpp_ext/libraries.py --packets
+	@touch $@
+
+$(VENV)/libraries: $(VENV)/torch $(PACKETS)
+	$(BIN)/python gvtorch/cpp_ext/libraries.py
 	@touch $@
 
 $(VENV)/ready: $(VENV)/packages $(VENV)/libraries

@@ -11,9 +11,9 @@ from helpers import ROOT
 
 @pytest.fixture
 def build(monkeypatch):
-    """build.py, which setuptools runs by its path from the root."""
+    """libraries.py, which is run by its path from the root."""
     monkeypatch.chdir(ROOT)
-    return runpy.run_path("gvtorch/cpp_ext/build.py")
+    return runpy.run_path("gvtorch/cpp_ext/libraries.py")
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """The compilers and the flags that gvtorch's own libraries and users' shaders have in common.
 
-build.py runs this file by its path, before gvtorch is installed, so it imports nothing of gvtorch.
+libraries.py runs this file by its path, before gvtorch is installed, so it imports nothing of it.
 
 Environment: CXX and NVCC name the compilers, CUDA_HOME a folder with bin/nvcc.
 """

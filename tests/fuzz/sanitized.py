@@ -65,7 +65,7 @@ def main(kind: str, *tests: str) -> int:
     flags = f"-fsanitize={','.join(KINDS[kind])} -fno-omit-frame-pointer -g1{CALLS.get(kind, '')}"
     os.environ |= {"GVTORCH_CUDA": "0", "CXX": f"{os.environ.get('CXX') or 'g++'} {flags}"}
     with mock.patch.object(platform, "machine", lambda: "any"):
-        build = runpy.run_path("gvtorch/cpp_ext/build.py")
+        build = runpy.run_path("gvtorch/cpp_ext/libraries.py")
         compilers = build["compilers"]
         compilers.CXX_FLAGS = tuple(flag.replace("-O3", "-O1") for flag in compilers.CXX_FLAGS)
         build["compile_libraries"](Path("gvtorch/cpp_ext/lib"))
