@@ -10,11 +10,14 @@
 #
 # Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else, the rest in .ci/constraints.txt.
 
+# What is compiled is compiled while packages are being installed.
+MAKEFLAGS += -j3
 PYTHON ?= python3
 VENV := .venv
 COMMA := ,
 SOURCES := $(wildcard gvtorch/cpp_ext/csrc/*.* gvtorch/cpp_ext/csrc/*/*)
 BIN := $(VENV)/bin
+COMPILE := gvtorch/cpp_ext/libraries.py gvtorch/cpp_ext/compilers.py
 PACKETS := gvtorch/cpp_ext/lib/packet.baseline.o
 TORCH := $(shell sed -n 's/.*"\(torch==[0-9.]*\)".*/\1/p' pyproject.toml)
 NATIVE := $(shell nvidia-smi --query-gpu=compute_cap --format=csv,noheader 2>/dev/null | sort -u | tr -d . | paste -sd ';')
@@ -109,21 +112,25 @@ $(VENV)/torch: pyproject.toml .ci/constraints.txt
 	$(PIP) setuptools wheel "$(TORCH)"
 	@touch $@
 
-# Installed without what is compiled, so that make -j2 does both side by side.
+# Installed without what is compiled, which is done side by side.
 $(VENV)/packages: $(VENV)/torch
 	GVTORCH_COMPILE=0 $(PIP) --no-build-isolation -e ".[dev]"
 	@touch $@
 
-# Packets need nothing of torch, so that make -j compiles them while it is installed.
-$(PACKETS): $(SOURCES) gvtorch/cpp_ext/libraries.py gvtorch/cpp_ext/compilers.py
-	$(PYTHON) gvtorch/cpp_ext/libraries.py --packets
+# Packets need nothing of torch: they are compiled while it is being installed.
+$(PACKETS): $(SOURCES) $(COMPILE)
+	$(PYTHON) gvtorch/cpp_ext/libraries.py packets
 	@touch $@
 
-$(VENV)/libraries: $(VENV)/torch $(PACKETS)
-	$(BIN)/python gvtorch/cpp_ext/libraries.py
+$(VENV)/cpu: $(VENV)/torch $(PACKETS)
+	$(BIN)/python gvtorch/cpp_ext/libraries.py cpu
 	@touch $@
 
-$(VENV)/ready: $(VENV)/packages $(VENV)/libraries
+$(VENV)/cuda: $(VENV)/torch $(SOURCES) $(COMPILE)
+	$(BIN)/python gvtorch/cpp_ext/libraries.py cuda
+	@touch $@
+
+$(VENV)/ready: $(VENV)/cuda $(VENV)/packages $(VENV)/cpu
 	@touch $@
 
 $(VENV)/bench: $(VENV)/ready

@@ -29,6 +29,7 @@ from helpers.compiled import prepared_compiler  # noqa: E402
 from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
+_LONG = ("test_user_packets.py", "test_stored.py", "test_soak.py", "test_viewer_hands.py")
 _ran: Counter[str] = Counter()
 _absent: set[str] = set()
 
@@ -64,10 +65,14 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Moves tests by hypothesis to the front: in processes that had run thousands of other tests,
     Python 3.11's interpreter was seen to loop forever at the first instruction of hypothesis' code.
+    Files of long tests that would be among the last come next, or other processes wait for them.
     """
-    items.sort(
-        key=lambda item: not getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
-    )
+
+    def place(item: pytest.Item) -> tuple[bool, bool]:
+        by_hypothesis = getattr(getattr(item, "obj", None), "is_hypothesis_test", False)
+        return not by_hypothesis, item.path.name not in _LONG
+
+    items.sort(key=place)
 
 
 @pytest.fixture(params=["reference", "cpp", "cuda"])

@@ -2,9 +2,10 @@
 wheel serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is built where nvcc is
 found and is loaded only where torch has CUDA.
 
-Run as a program, this file compiles them in the source tree; with --packets only the objects that
-need nothing of torch, so that any Python can do so while torch is still being installed. It runs
-before gvtorch is installed, so it imports nothing of gvtorch and runs compilers.py by its path.
+Run as a program, this file compiles them in the source tree: both, or with the word cpu or cuda
+one, or with the word packets only the CPU's objects that need nothing of torch, so that any Python
+can do so while torch is still being installed. It runs before gvtorch is installed, so it imports
+nothing of gvtorch and runs compilers.py by its path.
 
 Environment:
     GVTORCH_CUDA        auto (default: build when nvcc is found), 0 (never), 1 (fail without nvcc)
@@ -94,13 +95,14 @@ def commands(output: Path) -> dict[Path, list[list[str]]]:
     return calls
 
 
-def compile_libraries(output: Path) -> list[Path]:
+def compile_libraries(output: Path, kind: str = "") -> list[Path]:
     """Compiles, in parallel, the libraries that are missing or were made of other sources or with
-    other flags; returns the paths of all.
+    other flags; returns the paths of all. `kind` is cpu or cuda to compile one only.
     """
     output.mkdir(parents=True, exist_ok=True)
-    digest, calls = _source_digest(), commands(output)
-    with ThreadPoolExecutor(os.cpu_count()) as pool, ThreadPoolExecutor(len(calls)) as linkers:
+    digest = _source_digest()
+    calls = {path: call for path, call in commands(output).items() if path.stem.endswith(kind)}
+    with ThreadPoolExecutor(os.cpu_count()) as pool, ThreadPoolExecutor(2) as linkers:
 
         def make(library: Path) -> None:
             *compile_calls, link_call = calls[library]
@@ -155,4 +157,7 @@ def _run(call: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    (compile_packets if sys.argv[1:] == ["--packets"] else compile_libraries)(FOLDER / "lib")
+    if sys.argv[1:] == ["packets"]:
+        compile_packets(FOLDER / "lib")
+    else:
+        compile_libraries(FOLDER / "lib", *sys.argv[1:])
