@@ -252,3 +252,10 @@ def test_a_hand_in_a_browser_sees_its_jump(chromium, viewer):
         page.close()
     assert client_width == 320 and result.rate > 0
     assert len(result.delays) == 1 and 0 < result.delays[0] < 60e3
+
+
+def test_where_the_scan_is_missing_fog_takes_its_place(monkeypatch, tmp_path):
+    monkeypatch.setattr(scenes, "SCAN", tmp_path / "scan_8x8x8_uint8.raw.gz")
+    notes: list[str] = []
+    assert scenes.scan_or_fog(8, notes.append).name == "fog dense"
+    assert "file is missing" in notes[0] and notes[1] == "fog takes the place of the scan"

@@ -138,7 +138,11 @@ def made(
 
 def scan_or_fog(side: int, note: Callable[[str], object] = lambda _: None) -> BenchScene:
     """Returns the scan; where its file is missing, fog, after a note."""
-    return made(aneurism, side, note) or fog_dense(side)
+    scan = made(aneurism, side, note)
+    if scan is None:
+        note("fog takes the place of the scan")
+        return fog_dense(side)
+    return scan
 
 
 def worn_planes(side: int) -> Iterator[np.ndarray]:
