@@ -13,7 +13,8 @@ from helpers.shading import CENTRE, RADIUS, SPACING, ball, grid, parallel, phong
 
 import gvtorch as gv
 from gvtorch.fields.fractals import Fractal, FractalSettings
-from gvtorch.ops.shading import IsosurfaceNumbers, LightKind, ShadeParameters
+from gvtorch.ops.reference.shaders import IsosurfaceNumbers
+from gvtorch.ops.shading import LightKind, ShadeParameters
 from gvtorch.shaders.built_in import SurfaceSettings
 from gvtorch.shaders.lights import LightSettings, LitShader
 from gvtorch.tracing.tracer import Tracer

@@ -1,13 +1,12 @@
-"""The shader arguments of `shade_rays`: the shader's number, and 20 numbers for light, material and
-the shader itself. Shaders write them; the torch twin and csrc/shaders/shaders.h read them.
+"""The 20 numbers for light, material and the shader itself that `shade_rays` takes. Shaders write
+them; the torch twin and csrc/shaders/shaders.h read them.
 """
 
 from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from functools import cache
 from typing import Any, NamedTuple, TypeVar
@@ -33,45 +32,9 @@ def channel_widths(color_width: int) -> tuple[int, int]:
     return color_width, len(DIRECTIONS) * color_width
 
 
-@dataclass(frozen=True)
-class ShaderFacts:
-    """What a fused shader requires of the arguments of `shade_rays`."""
-
-    integrates: bool = False  # its table is (l, m, m, 4)
-    colored: bool = False  # its channel holds colours: see `channel_widths`
-    filtered: int = 0  # above 0: width of the colours in its second channel, of which only the
-    # pool's first bricks have them
-    features: int | None = 0  # how many it returns; None: as many as its second channel is wide
-    shadows: bool = False  # each sample sends a ray to the light
-
-
-#: The fused shaders, in the order of `GV_SHADERS` in csrc/shaders/shaders.h.
-SHADER_KINDS: Mapping[str, ShaderFacts] = {
-    "Lit": ShaderFacts(),
-    "PreIntegrated": ShaderFacts(integrates=True),
-    "StoredColor": ShaderFacts(colored=True),
-    "Isosurface": ShaderFacts(),
-    "Projection": ShaderFacts(features=1),
-    "Features": ShaderFacts(features=None),
-    "ShadowedLit": ShaderFacts(shadows=True),
-    "ShadowedColor": ShaderFacts(colored=True, shadows=True),
-    "GradientMagnitude": ShaderFacts(),
-    "Filtered": ShaderFacts(filtered=COLOR_WIDTH),
-    "ChannelMix": ShaderFacts(),
-    "Labels": ShaderFacts(features=1),
-    "FilteredLit": ShaderFacts(filtered=LIT_COLOR_WIDTH),
-}
-
-
 #: Filtered colours hold the moments of normals that no light reaches divided by this, and shaders
 #: multiply the moments' trace by it; as `kFaint` in csrc/shaders/light.h.
 FAINT = 32
-
-
-def shader_number(kind: str) -> int:
-    """Returns the number of a fused shader; raises ValueError if there is none of this name."""
-    check.one_of("shader", "kind", kind, SHADER_KINDS)
-    return [*SHADER_KINDS].index(kind)
 
 
 class LightKind(IntEnum):
@@ -80,56 +43,6 @@ class LightKind(IntEnum):
     HEADLIGHT = 0  # the eye of each ray
     DIRECTIONAL = 1  # infinitely far away
     POINT = 2  # a position
-
-
-class ProjectionKind(IntEnum):
-    """How a projection reduces the values along a ray."""
-
-    MAXIMUM = 0
-    MINIMUM = 1
-    MEAN = 2
-
-
-class StoredColorNumbers(NamedTuple):
-    """The numbers specific to stored colours."""
-
-    scale: Number  # factor that brings stored numbers to 0 to 1
-    reference: Number  # world length for which opacity is given
-    premultiplied: Number  # above 0: colours are stored times opacity
-    lit: Number  # above 0: colours are lit
-
-
-class IsosurfaceNumbers(NamedTuple):
-    """The numbers specific to isosurfaces."""
-
-    level: Number  # the value at the surface
-    filled: float = 1.0  # the solid side. 1: values >= level; -1: values < level; 0: neither
-    scale: float = 0.0  # factor of the second channel's four numbers, a colour; 0: use the table
-    premultiplied: float = 0.0  # above 0: its colours are stored times the fourth number
-
-
-class ProjectionNumbers(NamedTuple):
-    """The number specific to projections."""
-
-    kind: Number  # a ProjectionKind
-
-
-class GradientMagnitudeNumbers(NamedTuple):
-    """The number specific to shading by gradient magnitude."""
-
-    full: Number  # the gradient's length from which opacity is unreduced, value per world unit
-
-
-class FilteredNumbers(NamedTuple):
-    """The number specific to filtered colours."""
-
-    side: Number  # smallest side of the root cube, world units
-
-
-class LabelNumbers(NamedTuple):
-    """The number specific to labels."""
-
-    lit: Number  # above 0: labels are lit
 
 
 _Record = TypeVar("_Record")
@@ -155,7 +68,7 @@ class ShadeParameters(NamedTuple):
     specular: Number = 0.0  # factor of the highlight
     shininess: Number = 1.0  # exponent of the highlight
     light_growth: Number = 0.0  # of cones to the light, per unit length; point light: its width
-    own: Sequence[Number] | Tensor = ()  # up to four shader-specific numbers: a record above
+    own: Sequence[Number] | Tensor = ()  # up to four numbers of its own: a record beside its twin
     normal_scale: Number = 1.0  # a stored normal is number * scale + offset
     normal_offset: Number = 0.0
     octaves: Number = 0.0  # of scattering; 0: a surface's light
@@ -170,7 +83,7 @@ class ShadeParameters(NamedTuple):
         ).reshape(5, 4)
 
     def own_as(self, record: Callable[..., _Record]) -> _Record:
-        """Returns the shader-specific numbers by name, as one of the records above."""
+        """Returns the shader-specific numbers by name, as a record of theirs."""
         return record(*self.own[: _parameter_count(record)])
 
     @classmethod

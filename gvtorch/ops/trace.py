@@ -17,8 +17,10 @@ from ..base import constants as config
 from ..base.volume import CHANNEL_DTYPES
 from .arguments import RayArguments, ShadeArguments, TraceArguments
 from .reference import march, shaders
+from .reference.lit import Lit
+from .reference.shaders import SHADER_KINDS
 from .registry import Backend, choose_backend, fake_of
-from .shading import COLOR_WIDTH, SHADER_KINDS, ShaderFacts, channel_widths
+from .shading import COLOR_WIDTH, channel_widths
 
 
 def _fields(record: Any, dtype: torch.dtype, names: str) -> list[check.Field]:
@@ -108,14 +110,14 @@ def check_shade(
 ) -> None:
     """Checks everything that a shader reads; `user_op` is true for a user's shader."""
     context = "shade_rays"
-    kinds = [ShaderFacts()] if user_op else [*SHADER_KINDS.values()]
-    facts = kinds[check.integer(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
-    sizes = check_trace(context, rays, arguments, "lmm4" if facts.integrates else "lm4")
+    kinds = [Lit] if user_op else [kind.twin for kind in SHADER_KINDS.values()]
+    twin = kinds[check.integer(context, "shader", shading.shader, low=0, high=len(kinds) - 1)]
+    sizes = check_trace(context, rays, arguments, "lmm4" if twin.integrates else "lm4")
     device, shape = rays.origin_r3.device, "k" if user_op else "54"
     parameters = ("parameter_54", parameter_54, shape, arguments.table_lm4.dtype)
     check.tensors(context, device, [parameters])
     # Filtered colours are those of coarse slots only, so there are fewer.
-    other_width, other_slots = 0, "e" if facts.filtered else "b"
+    other_width, other_slots = 0, "e" if twin.filtered else "b"
     for name, bricks, constants, slots, width in (
         ("normal", shading.normal_bzyxc, shading.normal_tnc, "b", "3"),
         ("other", shading.other_bzyxc, shading.other_tnc, other_slots, "d"),
@@ -129,16 +131,16 @@ def check_shade(
             other_width = check.tensors(context, device, fields, sizes).get("d", 0)
             check.integer(context, f"bricks of {name}_bzyxc", len(bricks), low=0, high=sizes["b"])
     one, by_direction = channel_widths(COLOR_WIDTH)
-    if facts.colored and not (sizes["c"] in (one, by_direction) and arguments.component == 3):
+    if twin.colored and not (sizes["c"] in (one, by_direction) and arguments.component == 3):
         wanted = f"a channel of {one} or {by_direction} numbers and component 3"
         raise ValueError(f"{context}: stored colour needs {wanted}")
-    if facts.features is None and not other_width:
+    if twin.feature_count is None and not other_width:
         raise ValueError(f"{context}: features need other_bzyxc")
-    one, by_direction = channel_widths(facts.filtered)
-    if facts.filtered and other_width not in (one, by_direction):
+    one, by_direction = channel_widths(twin.filtered)
+    if twin.filtered and other_width not in (one, by_direction):
         wanted = f"an other_bzyxc of {one} or {by_direction} numbers"
         raise ValueError(f"{context}: filtered colours need {wanted}")
-    features = other_width if facts.features is None else facts.features
+    features = other_width if twin.feature_count is None else twin.feature_count
     limits = {} if user_op else {"high": features}
     check.integer(context, "features", shading.features, low=features, **limits)
     high = max(0, other_width - 1)

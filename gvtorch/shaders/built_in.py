@@ -1,8 +1,8 @@
 """The built-in shaders: which channels each reads, and which arguments it passes to the kernel.
 
-A shader has one entry in each of four files: its struct in cpp_ext/csrc/shaders, listed in
-shaders.h, which defines what it does with an interval; its torch twin in ops/reference/shaders.py;
-its kind, and the record of numbers that only it has, in ops/shading.py; and its class here.
+A shader stands in three files: its struct in cpp_ext/csrc/shaders, listed in shaders.h, which
+defines what it does with an interval; its torch twin in ops/reference/shaders.py, with its line in
+`SHADER_KINDS` and the record of numbers that only it has; and its class here.
 """
 
 from __future__ import annotations
@@ -25,18 +25,14 @@ from ..base.checked import (
     positive,
 )
 from ..ops import ShadeArguments
-from ..ops.shading import (
-    COLOR_WIDTH,
+from ..ops.reference.shaders import (
     GradientMagnitudeNumbers,
     IsosurfaceNumbers,
-    Number,
     ProjectionKind,
     ProjectionNumbers,
-    StoredColorNumbers,
-    Triple,
-    channel_widths,
-    pack,
 )
+from ..ops.reference.stored_color import StoredColorNumbers
+from ..ops.shading import COLOR_WIDTH, Number, Triple, channel_widths, pack
 from ..pool import N3Tree
 from .lights import LightSettings, LitShader, a_number, a_triple
 from .shader import (

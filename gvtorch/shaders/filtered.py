@@ -34,14 +34,9 @@ from ..io.stores.coarse import make_channel
 from ..io.stores.store import Store
 from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
-from ..ops.shading import (
-    COLOR_WIDTH,
-    LIT_COLOR_WIDTH,
-    FilteredNumbers,
-    ShadeParameters,
-    channel_widths,
-    shader_number,
-)
+from ..ops.reference.shaders import shader_number
+from ..ops.reference.stored_color import FilteredNumbers
+from ..ops.shading import COLOR_WIDTH, LIT_COLOR_WIDTH, ShadeParameters, channel_widths
 from ..pool import Channel, N3Tree
 from .built_in import Lit
 from .coarse_colors import (

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, flag, optional, positive
 from ..base.image_info import array_from_srgb
-from ..ops.shading import LabelNumbers
+from ..ops.reference.labels import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
 from .lights import LightSettings, LitShader

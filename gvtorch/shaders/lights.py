@@ -20,7 +20,8 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, Checked, class_name, whole_between
 from ..ops import ShadeArguments
-from ..ops.shading import LightKind, Number, ShadeParameters, Triple, shader_number
+from ..ops.reference.shaders import shader_number
+from ..ops.shading import LightKind, Number, ShadeParameters, Triple
 from ..pool import N3Tree
 from .shader import Shader
 

@@ -16,15 +16,8 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, Checked, flag, name_text, optional, whole_between
 from ..ops import ShadeArguments
-from ..ops.shading import (
-    SHADER_KINDS,
-    Number,
-    ShadeParameters,
-    ShaderFacts,
-    Triple,
-    pack,
-    shader_number,
-)
+from ..ops.reference.shaders import SHADER_KINDS, shader_number
+from ..ops.shading import Number, ShadeParameters, Triple, pack
 from ..pool import N3Tree
 
 LARGEST = 1e300  # limit of values and lengths, so that their differences are finite
@@ -179,7 +172,7 @@ class Shader(Checked):
     # Arguments of `shade_rays`.
 
     def own_numbers(self, tree: N3Tree) -> Sequence[Number]:
-        """Returns the numbers of this kind of shader, a record of `ops.shading`; most have none."""
+        """Returns the numbers of this kind of shader, a record beside its twin; most have none."""
         return ()
 
     def material(self) -> ShadeParameters:
@@ -188,8 +181,8 @@ class Shader(Checked):
 
     def feature_count(self, tree: N3Tree) -> int:
         """Returns the width c of `Hits.features` (r, c)."""
-        features = SHADER_KINDS.get(str(self.kind), ShaderFacts()).features
-        return tree.bricks.channels[str(self.other)].width if features is None else features
+        count = SHADER_KINDS[self.kind or "Lit"].twin.feature_count
+        return tree.bricks.channels[str(self.other)].width if count is None else count
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:
         """Returns `parameter_54` of `shade_rays` from the current light and material, after

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ..shading import LabelNumbers
+from ..shading import Number
 from .exact import clamp, dot, larger, smaller, stretch, unit
 from .lit import Lit
 from .march import Piece, Probe
@@ -83,11 +84,18 @@ def _weighted(values: Tensor, weight: Tensor) -> Tensor:
     return total
 
 
+class LabelNumbers(NamedTuple):
+    """The number specific to labels."""
+
+    lit: Number  # above 0: labels are lit
+
+
 class Labels(Lit):
     """The label of the nearest voxel."""
 
     bricks = LabelBricks
     channel: LabelBricks
+    feature_count = 1
 
     def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
         first, last = self.row_of(low), self.row_of(high)

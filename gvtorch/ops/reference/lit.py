@@ -24,6 +24,11 @@ class Lit(Plain):
     features: Tensor  # (r, c) sums
     shadows: Shadows | None
     bricks: ClassVar[type[ChannelBricks]] = ChannelBricks  # how it reads its channel
+    integrates: ClassVar[bool] = False  # its table is (l, m, m, 4)
+    colored: ClassVar[bool] = False  # its channel holds colours: see `channel_widths`
+    filtered: ClassVar[int] = 0  # above 0: width of the colours in its second channel, of which
+    # only the pool's first bricks have them
+    feature_count: ClassVar[int | None] = 0  # None: as many as its second channel is wide
 
     def __post_init__(self) -> None:
         self.normal = torch.zeros_like(self.light.direction)  # (r, 3) sum

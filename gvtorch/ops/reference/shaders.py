@@ -5,18 +5,16 @@ voxel than its value; light.py lights them, march.py walks the rays.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
+from ...base import check
 from ..arguments import RayArguments, ShadeArguments, TraceArguments
-from ..shading import (
-    SHADER_KINDS,
-    GradientMagnitudeNumbers,
-    IsosurfaceNumbers,
-    ProjectionKind,
-    ProjectionNumbers,
-    ShadeParameters,
-)
+from ..shading import Number, ShadeParameters
 from .channels import ChannelMix
 from .exact import clamp, dot, larger, sqrt_exact, stretch, unit
 from .labels import Labels
@@ -31,6 +29,8 @@ _BISECTIONS = 4
 
 class PreIntegrated(Lit):
     """A table over the values at both ends of an interval, (l, m, m, 4)."""
+
+    integrates = True
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         lengths = torch.where(piece.odd, piece.lengths, 1.0)
@@ -62,6 +62,15 @@ class PreIntegrated(Lit):
             for r in (row, row + 1)
         )
         return mix(near, far, row_weight)
+
+
+class IsosurfaceNumbers(NamedTuple):
+    """The numbers specific to isosurfaces."""
+
+    level: Number  # the value at the surface
+    filled: float = 1.0  # the solid side. 1: values >= level; -1: values < level; 0: neither
+    scale: float = 0.0  # factor of the second channel's four numbers, a colour; 0: use the table
+    premultiplied: float = 0.0  # above 0: its colours are stored times the fourth number
 
 
 class Isosurface(Lit):
@@ -141,10 +150,25 @@ class Isosurface(Lit):
         return self.transfer.look_up(self.level.expand_as(t))[:, :3]
 
 
+class ProjectionKind(IntEnum):
+    """How a projection reduces the values along a ray."""
+
+    MAXIMUM = 0
+    MINIMUM = 1
+    MEAN = 2
+
+
+class ProjectionNumbers(NamedTuple):
+    """The number specific to projections."""
+
+    kind: Number  # a ProjectionKind
+
+
 class Projection(Lit):
     """Maximum, minimum or mean of the value."""
 
     sees_empty = True
+    feature_count = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -186,6 +210,8 @@ class Projection(Lit):
 class Features(Lit):
     """All numbers of a second channel, composited with the transfer function's alpha."""
 
+    feature_count = None
+
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         rgba = self.rgba(piece, probe)
         share = torch.where(mask, self.sum.clear * rgba[:, 3], 0.0)
@@ -193,6 +219,12 @@ class Features(Lit):
         numbers = probe.numbers(self.other, piece.middle)
         self.features = self.features + share[:, None] * numbers
         self.sum.add(rgba, piece, mask)
+
+
+class GradientMagnitudeNumbers(NamedTuple):
+    """The number specific to shading by gradient magnitude."""
+
+    full: Number  # the gradient's length from which opacity is unreduced, value per world unit
 
 
 class GradientMagnitude(Lit):
@@ -207,30 +239,42 @@ class GradientMagnitude(Lit):
         self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, mask)
 
 
-#: Twins by the names of the C++ structs.
-TWINS: dict[str, type[Lit]] = {
-    "Lit": Lit,
-    "PreIntegrated": PreIntegrated,
-    "StoredColor": StoredColor,
-    "Isosurface": Isosurface,
-    "Projection": Projection,
-    "Features": Features,
-    "ShadowedLit": Lit,
-    "ShadowedColor": StoredColor,
-    "GradientMagnitude": GradientMagnitude,
-    "Filtered": Filtered,
-    "ChannelMix": ChannelMix,
-    "Labels": Labels,
-    "FilteredLit": FilteredLit,
+class ShaderKind(NamedTuple):
+    """A fused shader. Its twin tells what it requires of the arguments of `shade_rays`."""
+
+    twin: type[Lit]
+    shadows: bool = False  # whether each sample sends a ray to the light
+
+
+#: The fused shaders, in the order of `GV_SHADERS` in csrc/shaders/shaders.h.
+SHADER_KINDS: Mapping[str, ShaderKind] = {
+    "Lit": ShaderKind(Lit),
+    "PreIntegrated": ShaderKind(PreIntegrated),
+    "StoredColor": ShaderKind(StoredColor),
+    "Isosurface": ShaderKind(Isosurface),
+    "Projection": ShaderKind(Projection),
+    "Features": ShaderKind(Features),
+    "ShadowedLit": ShaderKind(Lit, shadows=True),
+    "ShadowedColor": ShaderKind(StoredColor, shadows=True),
+    "GradientMagnitude": ShaderKind(GradientMagnitude),
+    "Filtered": ShaderKind(Filtered),
+    "ChannelMix": ShaderKind(ChannelMix),
+    "Labels": ShaderKind(Labels),
+    "FilteredLit": ShaderKind(FilteredLit),
 }
+
+
+def shader_number(kind: str) -> int:
+    """Returns the number of a fused shader; raises ValueError if there is none of this name."""
+    check.one_of("shader", "kind", kind, SHADER_KINDS)
+    return [*SHADER_KINDS].index(kind)
 
 
 def shade_rays(
     rays: RayArguments, arguments: TraceArguments, shading: ShadeArguments, parameter_54: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Twin of `ops.shade_rays`."""
-    kind, facts = [*SHADER_KINDS.items()][shading.shader]
-    twin = TWINS[kind]
+    twin, is_shadowed = [*SHADER_KINDS.values()][shading.shader]
     walk = Walk.enter(rays, arguments, twin.bricks)
     beam, channel = walk.intervals.beam, walk.channel
     columns = (rays.origin_r3, rays.direction_r3, beam.moved, arguments.place_33[1])
@@ -244,7 +288,7 @@ def shade_rays(
     features = beam.first.new_zeros((len(beam.first), shading.features))
     shader = twin.begin(
         *(rays, arguments, walk, light, other, features),
-        shadows if facts.shadows else None,
+        shadows if is_shadowed else None,
     )
     walk.follow(shader)
     shader.done(walk)

@@ -5,12 +5,13 @@ csrc/shaders/stored_color.h and, lit, in shaders.h.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ...base.constants import EMPTY
-from ..shading import COLOR_WIDTH, LIT_COLOR_WIDTH, FilteredNumbers, StoredColorNumbers
+from ..shading import COLOR_WIDTH, LIT_COLOR_WIDTH, Number
 from .exact import clamp, sqrt_exact, stretch, unit
 from .lit import Lit
 from .march import Piece, Probe, a_little_above
@@ -25,10 +26,20 @@ class ColorBricks(ChannelBricks):
         return low.amin(1), high.amax(1)
 
 
+class StoredColorNumbers(NamedTuple):
+    """The numbers specific to stored colours."""
+
+    scale: Number  # factor that brings stored numbers to 0 to 1
+    reference: Number  # world length for which opacity is given
+    premultiplied: Number  # above 0: colours are stored times opacity
+    lit: Number  # above 0: colours are lit
+
+
 class StoredColor(Lit):
     """Colour and opacity of each voxel."""
 
     bricks = ColorBricks
+    colored = True
 
     @property
     def numbers(self) -> StoredColorNumbers:
@@ -62,10 +73,16 @@ class StoredColor(Lit):
         return rgba[:, :3], clamp(rgba[:, 3], 0, 1)
 
 
+class FilteredNumbers(NamedTuple):
+    """The number specific to filtered colours."""
+
+    side: Number  # smallest side of the root cube, world units
+
+
 class Filtered(Lit):
     """The transfer function, and filtered colours where bricks have them (in coarse slots)."""
 
-    color_width = COLOR_WIDTH
+    filtered = COLOR_WIDTH
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         fine, coarse = probe.nodes.fine, probe.nodes.coarse
@@ -118,7 +135,7 @@ class Filtered(Lit):
         """Returns colour and alpha (r, 4) of a node's voxels as rays see them; alphas (r,) of
         intervals; and their ratios to the voxels' alphas. `stored`: `stored_numbers`.
         """
-        color = _by_direction(self.light.direction, stored, self.color_width)[:, :COLOR_WIDTH]
+        color = _by_direction(self.light.direction, stored, self.filtered)[:, :COLOR_WIDTH]
         stored_alpha = clamp(color[:, 3], 0, 1)
         side = self.light.parameters.own_as(FilteredNumbers).side
         alpha = stretch(stored_alpha, piece.length * holder.scale / side)
@@ -129,7 +146,7 @@ class Filtered(Lit):
 class FilteredLit(Filtered):
     """The lit transfer function, and filtered colours with moments of normals."""
 
-    color_width = LIT_COLOR_WIDTH
+    filtered = LIT_COLOR_WIDTH
 
     def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         self.lit(self.rgba(piece, probe), piece, probe, mask)

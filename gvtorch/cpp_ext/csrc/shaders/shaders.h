@@ -464,7 +464,7 @@ struct GradientMagnitude : Plain<T> {
 };
 
 // The fused shaders: X(kind, struct, true if each sample traces a cone to the light), in the order of their numbers, as
-// in SHADER_KINDS of ops/shading.py.
+// in SHADER_KINDS of ops/reference/shaders.py.
 #define GV_SHADERS(X)                            \
   X(Lit, Lit, false)                             \
   X(PreIntegrated, PreIntegrated, false)         \
