@@ -74,7 +74,12 @@ GV_HD To bit_cast(From value) {
   return out;
 }
 
-// Converts a voxel to a number. Halves are converted by shifting their bits and scaling, exact for denormals too.
+// A half that is converted without an instruction for halves.
+struct PlainHalf {
+  uint16_t bits;
+};
+
+// Converts a voxel to a number.
 template <class T, class Voxel>
 GV_HD T number(Voxel voxel) {
   return static_cast<T>(voxel);
@@ -83,13 +88,24 @@ template <class T>
 GV_HD T number(BFloat16 voxel) {
   return static_cast<T>(bit_cast<float>(static_cast<uint32_t>(voxel.bits) << 16));
 }
+// Shifts the bits of a half and scales, exact for denormals too.
 template <class T>
-GV_HD T number(Half voxel) {
+GV_HD T number(PlainHalf voxel) {
   const uint32_t sign = static_cast<uint32_t>(voxel.bits & 0x8000) << 16;
   const uint32_t magnitude = voxel.bits & 0x7fff;
   const float scaled = bit_cast<float>(magnitude << 13) * 5.192296858534828e33f;  // 2^112: the biases' difference
   const uint32_t bits = magnitude < 0x7c00 ? bit_cast<uint32_t>(scaled) : (magnitude << 13) | 0x7f800000;
   return static_cast<T>(bit_cast<float>(sign | bits));
+}
+template <class T>
+GV_HD T number(Half voxel) {
+#ifdef __CUDA_ARCH__
+  float number;
+  asm("cvt.f32.f16 %0, %1;" : "=f"(number) : "h"(voxel.bits));
+  return static_cast<T>(number);
+#else
+  return number<T>(PlainHalf{voxel.bits});
+#endif
 }
 
 // Stamps: many rays store the same value, so a relaxed store is enough; reading first avoids most stores and keeps the

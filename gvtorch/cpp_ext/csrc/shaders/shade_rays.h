@@ -225,7 +225,11 @@ struct ShadeRay : Walk<T> {
       piece.end = end;
       piece.set_odd();
       piece.value = piece.front = piece.back = probe.value(piece.middle);
-      shader.add(true, piece, probe, sum);
+      if constexpr (AnyShader::kFiltered > 0) {
+        shader.plain().add(true, piece, probe, sum);  // it has no brick, so no filtered colours
+      } else {
+        shader.add(true, piece, probe, sum);
+      }
       ++samples;
     }
     GV_HD int32_t take_intervals(const RayProbe& probe, const Intervals<T>& intervals, int32_t run_length, bool last) {
