@@ -12,7 +12,11 @@ from helpers import ROOT
 from helpers.opengl import IN_OPENGL
 
 # Options that make them short.
-SHORT = {"mandelbulb_film": ["--frames", "4"], "labels": ["--side", "64"]}
+SHORT = {
+    "galaxy": ["--stars", "20000"],
+    "labels": ["--side", "64"],
+    "mandelbulb_film": ["--frames", "4"],
+}
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
