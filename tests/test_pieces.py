@@ -27,11 +27,6 @@ from gvtorch.tracing.trees import trace_trees
 
 
 @pytest.fixture(scope="module")
-def tree_of_channels(channels) -> gv.N3Tree:
-    return gv.N3Tree.from_volume(channels, 4)
-
-
-@pytest.fixture(scope="module")
 def noise() -> gv.Volume:
     """All voxels differ, so nothing is EMPTY, CONSTANT or hidden."""
     generator = torch.Generator().manual_seed(3)
