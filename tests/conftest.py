@@ -193,6 +193,11 @@ def channels(blobs) -> dict[str, gv.Volume]:
     }
 
 
+@pytest.fixture(scope="session")
+def tree_of_channels(channels) -> gv.N3Tree:
+    return gv.N3Tree.from_volume(channels, 4)
+
+
 @pytest.fixture
 def session():
     """A view of a ball, without a server."""

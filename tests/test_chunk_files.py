@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import Library
 from helpers.stores import noise, serving
 
 import gvtorch as gv
@@ -21,7 +22,7 @@ from gvtorch.io import http, relay
 from gvtorch.io.stores.chunk_files import METADATA_FILES, ChunkFiles, begin_read
 from gvtorch.io.stores.tensorstores import kvstore, opened_at
 
-ts = pytest.importorskip("tensorstore")
+ts = Library("tensorstore")
 
 SHAPE = (12, 9, 10)
 CHUNK = [4, 3, 5]

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 import gvtorch as gv
-from gvtorch.base.volume import CHANNEL_DTYPES, movable
-from gvtorch.pool.downsample import (
+from gvtorch.base.downsample import (
     as_grid,
     by_node,
     from_grid,
@@ -15,6 +14,7 @@ from gvtorch.pool.downsample import (
     pool_min,
     reduce_windows,
 )
+from gvtorch.base.volume import CHANNEL_DTYPES, movable
 
 DTYPES = [str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES]
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.backend("cuda"))]

@@ -10,9 +10,9 @@ from helpers.marcher import trilinear
 from helpers.rays import rays_along
 
 import gvtorch as gv
+from gvtorch.base.downsample import pool_directional
 from gvtorch.base.volume import DIRECTIONS
 from gvtorch.io.stores.conversion import convert
-from gvtorch.pool.downsample import pool_directional
 from gvtorch.pool.pyramid import volume_levels
 
 RED, GREEN = (1.0, 0.1, 0.0), (0.0, 0.9, 0.2)

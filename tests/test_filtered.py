@@ -4,6 +4,7 @@ equal those of 256 rays a pixel.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import pytest
@@ -71,15 +72,20 @@ def test_close_by_it_is_the_transfer_function():
         assert torch.equal(getattr(near, field), getattr(plain, field)), field
 
 
+@functools.cache
+def seen_from_afar(kind: str) -> tuple[gv.N3Tree, gv.TransferFunction, gv.Filtered]:
+    """Returns `walls` as a tree, a function that shows it as matter of a kind, and its shader."""
+    transfer = MISTY if kind == "misty" else gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
+    tree = gv.N3Tree.from_volume(walls(), 8)
+    return tree, transfer, gv.Filtered.of(tree, walls(), transfer)
+
+
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("pixel", [4.0, 16.0])
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.37, 0.23, 1.0)])
 @pytest.mark.parametrize("kind", ["misty", "opaque"])
 def test_from_afar_it_shows_what_many_fine_rays_show(kind, direction, pixel):
-    transfer = MISTY if kind == "misty" else gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
-    volume = walls()
-    tree = gv.N3Tree.from_volume(volume, 8)
-    shader = gv.Filtered.of(tree, volume, transfer)
+    tree, transfer, shader = seen_from_afar(kind)
     assert tree.bricks.channels["filtered"].width == (4 if kind == "misty" else 24)
     truth = picture(tree, transfer, direction, pixel, 16, "finest")
     light, psnr = compare(picture(tree, shader, direction, pixel), truth)
@@ -117,6 +123,17 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
         assert (before[4:] < 0.97 * finest[4:]).all()
 
 
+@functools.cache
+def solid_ball(radius: float) -> tuple[gv.N3Tree, gv.Filtered]:
+    axis = torch.arange(96) - 47.5
+    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+    inside = radius - (x * x + y * y + z * z).sqrt()
+    volume = gv.Volume((0.5 + inside / 2).clamp(0, 1))
+    tree = gv.N3Tree.from_volume(volume, 8)
+    transfer = gv.TransferFunction([(0.49, 0), (0.51, 0.999)])
+    return tree, gv.Filtered.of(tree, volume, transfer)
+
+
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
     ("direction", "growths"),
@@ -128,36 +145,29 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
 )
 def test_a_solid_ball_covers_a_disc_from_afar(direction, growths):
     """Its rim hardly grows, because hidden voxels hold the colours of visible neighbours."""
-    radius, axis = 36.0, torch.arange(96) - 47.5
-    z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-    inside = radius - (x * x + y * y + z * z).sqrt()
-    volume = gv.Volume((0.5 + inside / 2).clamp(0, 1))
-    tree = gv.N3Tree.from_volume(volume, 8)
-    shader = gv.Filtered.of(tree, volume, gv.TransferFunction([(0.49, 0), (0.51, 0.999)]))
+    radius = 36.0
+    tree, shader = solid_ball(radius)
     for pixel, grown in zip((4.0, 8.0, 16.0), growths, strict=True):
         covered = picture(tree, shader, direction, pixel)[..., 3].sum()
         assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
 
 
 @pytest.mark.parametrize("directions", [True, False])
-@pytest.mark.parametrize("voxels", [1, 40, 300])
-def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, voxels, directions):
+def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, directions):
     def colors() -> torch.Tensor:
         tree, shader = filtered(SHADER, directions=directions)
         return tree.bricks.bricks[shader.other]
 
     whole = colors()
-    monkeypatch.setitem(coarse_colors._TILE_VOXELS, "cpu", voxels)
-    torch.testing.assert_close(colors(), whole, rtol=0, atol=1e-3)
+    for voxels in (1, 40, 300):
+        monkeypatch.setitem(coarse_colors._TILE_VOXELS, "cpu", voxels)
+        torch.testing.assert_close(colors(), whole, rtol=0, atol=1e-3)
     assert whole.unique().numel() > 1000, "the test must see something"
 
 
 @pytest.mark.backend("cpp")
 def test_soft_shadows_are_as_dark_as_those_of_many_fine_rays():
-    volume = walls()
-    tree = gv.N3Tree.from_volume(volume, 8)
-    transfer = gv.TransferFunction([(0.4, 0), (0.5, 0.95)])
-    filtered = gv.Filtered.of(tree, volume, transfer)
+    tree, transfer, filtered = seen_from_afar("opaque")
     camera = gv.Camera.orbit(30, 20, 1.7, 16.0, 60, 60)
     sun = gv.DirectionalLight((-1.0, -1.2, -0.6), angle=25.0)
 
@@ -226,14 +236,19 @@ def test_a_tree_of_one_brick_has_no_colours():
             ), hold
 
 
+@functools.cache
+def resident(directions: bool, device: str) -> tuple[gv.N3Tree, gv.Filtered]:
+    """Returns `matter` as a tree, and its shader."""
+    tree = gv.N3Tree.from_volume(matter(), 4, device=device)
+    return tree, gv.Filtered.of(tree, matter(), SHADER, directions=directions)
+
+
 @pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
 @pytest.mark.parametrize("directions", [True, False])
 def test_streamed_equals_resident(compiled, directions, hold):
     """In pools that hold all bricks, and in pools that hold a part."""
     device = "cuda" if compiled == "cuda" else "cpu"
-    volume = matter()
-    tree = gv.N3Tree.from_volume(volume, 4, device=device)
-    resident = gv.Filtered.of(tree, volume, SHADER, directions=directions)
+    volume, (tree, whole) = matter(), resident(directions, device)
     for size, share in ((4_000_000, 0.5), (150_000, 0.25)):
         shader = gv.Filtered(SHADER, directions=directions)
         producer = gv.VolumeProducer(volume, hold=hold, filtered=shader)
@@ -245,7 +260,7 @@ def test_streamed_equals_resident(compiled, directions, hold):
             for distance in (1.5, 4.0, 10.0, 0.7):
                 camera = gv.Camera.orbit(width=40, height=30, distance=distance)
                 actual = engine.render(camera, shader)
-                expected = gv.render(tree, camera, resident)
+                expected = gv.render(tree, camera, whole)
                 assert actual.stats.converged
                 crowded |= actual.stats.capacity_exceeded
                 for field in ("color", "alpha", "depth"):

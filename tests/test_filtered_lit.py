@@ -72,8 +72,8 @@ SCANS = {
 def test_from_afar_it_shows_what_many_fine_rays_show(scan, kind, pixel, light, least, tolerance):
     file, (low, high, peak), (clear, solid) = SCANS[scan]
     whole = gv.read_volume(ROOT / "examples" / "data" / file)
-    z, y, x = (max(0, size // 2 - 48) for size in whole.data.shape[:3])
-    volume = gv.Volume(whole.data[z : z + 96, y : y + 96, x : x + 96].contiguous(), whole.spacing)
+    z, y, x = (max(0, size // 2 - 32) for size in whole.data.shape[:3])
+    volume = gv.Volume(whole.data[z : z + 64, y : y + 64, x : x + 64].contiguous(), whole.spacing)
     color = [(clear, 0.8, 0.4, 0.25), (2 * solid, 1, 0.9, 0.7)]
     opacity = [(low, 0), (high, peak)] if kind == "translucent" else [(clear, 0), (solid, 0.95)]
     lit = gv.Lit(gv.TransferFunction(opacity, color), light=light)

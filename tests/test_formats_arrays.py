@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from helpers import Library
 from helpers.stores import noise
 
 import gvtorch as gv
@@ -14,9 +15,9 @@ from gvtorch.io.reading import ObjectSource, open_source
 from gvtorch.io.stores import conversion_plan
 from gvtorch.io.stores.conversion import convert
 
-xarray = pytest.importorskip("xarray")
-dask = pytest.importorskip("dask.array")
-zarr = pytest.importorskip("zarr")
+xarray = Library("xarray")
+dask = Library("dask.array")
+zarr = Library("zarr")
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def labelled(grid) -> xarray.DataArray:
         torch.from_numpy,
         lambda grid: dask.from_array(grid, chunks=(4, 4, 4)),
         lambda grid: zarr.array(grid, chunks=(4, 4, 4)),
-        xarray.DataArray,
+        lambda grid: xarray.DataArray(data=grid),
         lambda grid: grid.astype(">i2"),
     ],
     ids=["array", "interface", "fortran", "torch", "dask", "zarr", "xarray", "swapped"],

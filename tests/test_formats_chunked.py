@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers import gvtorch as run
 from helpers.damage import assert_robust
 from helpers.stores import noise
@@ -15,9 +16,9 @@ import gvtorch as gv
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores.conversion import convert
 
-zarr = pytest.importorskip("zarr")
-xarray = pytest.importorskip("xarray")
-ts = pytest.importorskip("tensorstore")
+zarr = Library("zarr")
+xarray = Library("xarray")
+ts = Library("tensorstore")
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers.damage import assert_robust
 from helpers.stores import noise, stopped_at
 
@@ -16,8 +17,8 @@ import gvtorch as gv
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores.conversion import convert
 
-pydicom = pytest.importorskip("pydicom")
-itk = pytest.importorskip("SimpleITK")
+pydicom = Library("pydicom")
+itk = Library("SimpleITK")
 
 SHAPE = (6, 9, 12)  # z y x
 SPACING = (0.5, 0.75, 2.5)

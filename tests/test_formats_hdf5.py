@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers.damage import assert_robust
 from helpers.stores import noise
 
@@ -14,9 +15,9 @@ import gvtorch as gv
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores.conversion import convert
 
-h5py = pytest.importorskip("h5py")
-xarray = pytest.importorskip("xarray")
-pytest.importorskip("h5netcdf")
+h5py = Library("h5py")
+xarray = Library("xarray")
+Library("h5netcdf")
 
 
 @pytest.fixture

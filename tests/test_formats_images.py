@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers.damage import assert_robust
 from helpers.stores import noise
 
@@ -17,10 +18,10 @@ from gvtorch.io.reading import open_source
 from gvtorch.io.source import number_type
 from gvtorch.io.stores.conversion import convert
 
-itk = pytest.importorskip("SimpleITK")
-mrcfile = pytest.importorskip("mrcfile")
-vtk = pytest.importorskip("vtkmodules.all")
-numpy_support = pytest.importorskip("vtkmodules.util.numpy_support")
+itk = Library("SimpleITK")
+mrcfile = Library("mrcfile")
+vtk = Library("vtkmodules.all")
+numpy_support = Library("vtkmodules.util.numpy_support")
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers.damage import assert_robust
 from helpers.stores import noise
 
@@ -17,7 +18,7 @@ import gvtorch as gv
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores.conversion import convert
 
-czi = pytest.importorskip("pylibCZIrw.czi")
+czi = Library("pylibCZIrw.czi")
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers.damage import assert_robust
 from helpers.stores import noise
 
@@ -15,9 +16,9 @@ import gvtorch as gv
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores.conversion import convert
 
-tifffile = pytest.importorskip("tifffile")
-itk = pytest.importorskip("SimpleITK")
-Image = pytest.importorskip("PIL.Image")
+tifffile = Library("tifffile")
+itk = Library("SimpleITK")
+Image = Library("PIL.Image")
 
 
 def ome(file: Path, data: np.ndarray, axes: str = "TCZYX", **options: object) -> Path:

@@ -11,7 +11,7 @@ import zlib
 
 import numpy as np
 import pytest
-from helpers import gvtorch, shared
+from helpers import Library, gvtorch, shared
 from helpers.damage import assert_robust
 from helpers.vdb import (
     ACTIVE,
@@ -33,7 +33,7 @@ import gvtorch as gv
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores import conversion_plan
 
-pytest.importorskip("imagecodecs")
+Library("imagecodecs")
 
 
 @pytest.mark.parametrize("name", ["wdas_cloud_sixteenth", "dragon_smoke"])

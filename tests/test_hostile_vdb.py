@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from helpers import Library
 from helpers.vdb import (
     BOX,
     HIGH,
@@ -24,7 +25,7 @@ from helpers.vdb import (
 import gvtorch as gv
 from gvtorch.io.reading import open_source
 
-pytest.importorskip("imagecodecs")
+Library("imagecodecs")
 
 
 def refused(path, content: bytes, reason: str) -> None:

@@ -12,7 +12,7 @@ from helpers.labels import SPACING, WIDE, kept, numbers
 
 import gvtorch as gv
 from gvtorch.base import labels as base
-from gvtorch.pool.downsample import pool_majority
+from gvtorch.base.downsample import pool_majority
 from gvtorch.pool.pyramid import volume_levels
 
 # --- what a volume keeps

@@ -159,7 +159,8 @@ def test_nothing_behind_an_opaque_layer_is_used_or_asked_for(blobs, backend_name
     bare = copy_to(whole, "cpu")
     leaf = whole.nodes.loc_t4[:, 3:] == whole.depth
     bare.nodes.brick_tn[(bare.nodes.brick_tn >= 0) & leaf] = config.ABSENT
-    view = camera(32, distance=1.5).placed(whole.box)
+    side = 24 if backend_name == "reference" else 32  # the twin is slow
+    view = camera(side, distance=1.5).placed(whole.box)
     normal = -torch.tensor([0.469846, 0.342020, 0.813798], dtype=torch.float64)  # towards the box
     point = middle(blobs)
     depth = plane_distances(view, point, tuple(normal.tolist()))

@@ -184,6 +184,17 @@ def test_import_loads_torch_and_nothing_heavier():
     assert not loaded & heavy
 
 
+def test_workers_of_a_conversion_load_no_torch():
+    """Each would take a second longer to start, and more memory. They import the task's module and
+    those of sources that are read from files.
+    """
+    modules = "io.formats, gvtorch.io.stores.shard, gvtorch.io.label_source, gvtorch.io.oblique"
+    code = f"import sys, tensorstore, gvtorch.{modules}; print(*sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(run.stdout.split())
+    assert "gvtorch.base.downsample" in loaded and "torch" not in loaded
+
+
 def test_test_files_import_helpers_and_no_test_file():
     for path in (ROOT / "tests").rglob("*.py"):
         for name in imported(path):

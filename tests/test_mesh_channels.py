@@ -181,7 +181,7 @@ def test_a_killed_voxelization_goes_on_and_is_the_same(tmp_path):
     ball = meshes.sphere(5)
     file = tmp_path / "ball.ply"
     trimesh.Trimesh(ball.vertices, ball.faces, process=False).export(file)
-    flags = ["--resolution", "200", "--channels", "coverage,distance", "--workers", "1"]
+    flags = ["--resolution", "140", "--channels", "coverage,distance", "--workers", "1"]
     whole, target = tmp_path / "whole.zarr", tmp_path / "killed.zarr"
     assert gvtorch("voxelize", file, "-o", whole, *flags).returncode == 0
     command = [sys.executable, "-m", "gvtorch", "voxelize", file, "-o", target, *flags]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import gvtorch, meshes, shared
+from helpers import Library, gvtorch, meshes, shared
 from helpers.stores import stopped_at
 
 import gvtorch as gv
@@ -17,7 +17,7 @@ from gvtorch.io.mesh_source import MeshSource
 from gvtorch.io.stores.store_layout import WORK
 from gvtorch.meshes.voxelizer import Voxelizer
 
-trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
+trimesh = Library("trimesh")
 
 CUBE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n"
 

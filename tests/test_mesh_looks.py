@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from helpers import meshes
+from helpers import Library, meshes
 
 import gvtorch as gv
 from gvtorch.meshes.voxelizer import Voxelizer
 
-trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")
-Image = pytest.importorskip("PIL.Image", reason="Pillow is not installed")
+trimesh = Library("trimesh")
+Image = Library("PIL.Image")
 
 
 def linear(value: float) -> float:

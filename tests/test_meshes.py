@@ -126,13 +126,13 @@ def test_signed_distance_of_a_box_in_closed_form():
 
 @pytest.mark.parametrize("name", SHARED)
 def test_signed_distance_is_libigl_s(name):
-    """At 10^5 points (open bunny: 10^4); the sign against igl's winding number of closed parts: the
-    fast one, which is nowhere near 1/2, and at 2000 points the exact one.
+    """At 30,000 points (open bunny: 10^4); the sign against igl's winding number of closed parts:
+    the fast one, which is nowhere near 1/2, and at 2000 points the exact one.
     """
     igl = pytest.importorskip("igl", reason="the peer libigl is not installed")
     mesh = gv.read_mesh(shared(SHARED[name]))
     size = float((mesh.bounds[1] - mesh.bounds[0]).max())
-    point = places(mesh, 10_000 if name == "open bunny" else 100_000)
+    point = places(mesh, 10_000 if name == "open bunny" else 30_000)
     geometry = Geometry(mesh)
     distance = geometry.signed_distance(torch.from_numpy(point)).numpy()
     squared, *_ = igl.point_mesh_squared_distance(point, mesh.vertices, mesh.faces)
@@ -144,7 +144,7 @@ def test_signed_distance_is_libigl_s(name):
     winding = igl.fast_winding_number(mesh.vertices, closed, point)
     exact = igl.winding_number(mesh.vertices, closed, point[:2000])
     assert np.abs(winding[:2000] - exact).max() < 0.01 < np.abs(np.abs(winding) - 0.5).min()
-    assert np.array_equal(np.abs(winding) > 0.5, distance < 0) and (distance < 0).sum() > 2000
+    assert np.array_equal(np.abs(winding) > 0.5, distance < 0) and (distance < 0).sum() > 600
 
 
 @pytest.mark.parametrize("name", ["spot", "castle"])

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import Library
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -19,7 +20,7 @@ from gvtorch.io.reading import open_source
 from gvtorch.io.source import MemorySource, place_axes
 from gvtorch.io.stores.conversion import convert
 
-nibabel = pytest.importorskip("nibabel")
+nibabel = Library("nibabel")
 SIZE = (14, 11, 9)  # voxels along the stored axes
 
 

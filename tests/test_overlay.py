@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 import torch
-from helpers import gvtorch
+from helpers import Library, gvtorch
 from helpers.viewer import pixels
 
 import gvtorch as gv
@@ -17,7 +17,7 @@ from gvtorch.base.units import unit_symbol
 from gvtorch.pictures.files import write_png_rows
 from gvtorch.pictures.overlay import _labels, _round_below, _ticks
 
-pytest.importorskip("PIL")
+Library("PIL")
 HOT = gv.TransferFunction.preset("hot", 0, 200)
 
 

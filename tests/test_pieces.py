@@ -153,9 +153,9 @@ def test_a_wrong_share_is_one_clear_error(blobs, clear):
 
 
 @pytest.mark.parametrize("name", SHADERS)
-def test_every_shader_is_cut_by_planes_and_boxes(channels, compiled, name):
+def test_every_shader_is_cut_by_planes_and_boxes(tree_of_channels, compiled, name):
     """A plane ends rays where its formula says, and several pieces equal the twin's."""
-    tree, shader = gv.N3Tree.from_volume(channels, 4), SHADERS[name]
+    tree, shader = tree_of_channels, SHADERS[name]
     rays = camera_rays(tree, 10, distance=1.3)
     plane = (0.6, 0.0, -0.8, 8.0)
     normal = torch.tensor(plane[:3], dtype=torch.float64)

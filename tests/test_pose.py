@@ -98,8 +98,8 @@ NEAR = {"atol": 1e-9, "rtol": 1e-9}  # for float64
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", SHADERS)
-def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(channels, name, backend):
-    tree = copy_to(gv.N3Tree.from_volume(channels, 4), DEVICES[backend])
+def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(tree_of_channels, name, backend):
+    tree = copy_to(tree_of_channels, DEVICES[backend])
     rays, shader = camera(tree, 8 if backend == "reference" else 20), SHADERS[name]
     options = {"dtype": torch.float64, "backend": backend}
     expected = gv.trace(tree, rays.to(tree.device), shader, **options)

@@ -249,19 +249,21 @@ size = int(sys.argv[1])
 gv.render_tiles(render, gv.Camera.orbit(width=64, height=64), "warm.tif")
 before = peak()
 camera = gv.Camera.orbit(width=size, height=size)
-gv.render_tiles(render, camera, sys.argv[2], memory="24 MB")
+for name in sys.argv[2:]:
+    gv.render_tiles(render, camera, name, memory="24 MB")
 print(peak() - before)
 """
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.npy"])
-def test_memory_is_bounded_whatever_the_size(tmp_path, name):
+def test_memory_is_bounded_whatever_the_size(tmp_path):
     """The layers of 2048^2 pixels alone would take 100 MB."""
-    command = [sys.executable, "-c", MEASURE, "2048", name]
+    names = ["a.png", "a.tif", "a.npy"]
+    command = [sys.executable, "-c", MEASURE, "2048", *names]
     run = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
     assert float(run.stdout) < 60
-    assert gv.read_image(tmp_path / name).shape[:2] == (2048, 2048)
+    for name in names:
+        assert gv.read_image(tmp_path / name).shape[:2] == (2048, 2048)
 
 
 def test_what_breaks_off_leaves_no_file(blobs, tmp_path):

@@ -43,6 +43,24 @@ def tree(trees) -> gv.N3Tree:
     return trees[2]
 
 
+@pytest.fixture(scope="module")
+def tree_of_bricks_of_8(channels) -> gv.N3Tree:
+    return gv.N3Tree.from_volume(channels, 8)
+
+
+@pytest.fixture(scope="module")
+def with_and_without_ranges(channels) -> dict[float | None, tuple[gv.N3Tree, gv.N3Tree]]:
+    """Trees, and copies in which any node may hold any value, by threshold."""
+    pairs = {}
+    for threshold in (None, 0.2):
+        ranged = gv.N3Tree.from_volume(channels, 4, threshold=threshold)
+        unknown = copy_to(ranged, "cpu")
+        for channel, ranges in unknown.nodes.ranges.items():
+            ranges[:, :, 0], ranges[:, :, 1] = ranged.bricks.channels[channel].limits
+        pairs[threshold] = ranged, unknown
+    return pairs
+
+
 @pytest.mark.parametrize("lod", ["finest", "auto"])
 @pytest.mark.parametrize("name", SHADERS)
 def test_compiled_equals_reference(tree, compiled, name, lod):
@@ -123,11 +141,8 @@ def test_missing_nodes_give_equal_pictures_and_requests(tree, compiled, name):
 
 @pytest.mark.parametrize("threshold", [None, 0.2])
 @pytest.mark.parametrize("name", SHADERS)
-def test_what_ranges_hide_changes_no_bit(channels, name, threshold):
-    ranged = gv.N3Tree.from_volume(channels, 4, threshold=threshold)
-    unknown = copy_to(ranged, "cpu")
-    for channel, ranges in unknown.nodes.ranges.items():
-        ranges[:, :, 0], ranges[:, :, 1] = ranged.bricks.channels[channel].limits
+def test_what_ranges_hide_changes_no_bit(with_and_without_ranges, name, threshold):
+    ranged, unknown = with_and_without_ranges[threshold]
     rays = camera_rays(ranged, 16, distance=1.6)
     for lod in ("finest", "auto"):
         options = gv.RenderOptions(lod=lod)
@@ -257,10 +272,10 @@ def test_an_edited_transfer_function_is_the_next_picture_s(tree, compiled, kind,
 
 
 @pytest.mark.parametrize("name", SHADERS)
-def test_an_engine_draws_the_same(channels, name):
+def test_an_engine_draws_the_same(channels, tree_of_bricks_of_8, name):
     shader = SHADERS[name]
     camera = gv.Camera.orbit(width=24, height=18, distance=1.5)
-    resident = gv.render(gv.N3Tree.from_volume(channels, 8), camera, shader)
+    resident = gv.render(tree_of_bricks_of_8, camera, shader)
     with gv.Engine(gv.VolumeProducer(channels), brick_size=8) as engine:
         picture = engine.render(camera, shader)
     assert picture.stats.converged

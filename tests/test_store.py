@@ -21,10 +21,10 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base.boxes import repeat_edges
+from gvtorch.base.downsample import pool_mean
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.level_reader import StoreError
 from gvtorch.io.stores.store import Store
-from gvtorch.pool.downsample import pool_mean
 
 DTYPES = ["uint8", "int8", "uint16", "int16", "float16", "float32"]
 

@@ -13,11 +13,12 @@ import numpy as np
 from torch import Tensor
 
 from . import boxes, check
+from .boxes import check_extent
 from .image_info import ChannelInfo, ImageInfo
 from .labels import check_narrowed
 from .named_axes import ask_axes, axes_placement, even_steps, named_axes
 from .units import spacing_of
-from .volume import Volume, check_extent, plain_tensor, to_numpy
+from .volume import Volume, plain_tensor, to_numpy
 
 #: Attributes by which NetCDF and HDF5 files specify how stored numbers map to values.
 _PACKING_ATTRIBUTES = (

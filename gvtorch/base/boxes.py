@@ -1,17 +1,17 @@
 """Boxes of voxels, `low` to `high` in z, y, x: indexing them and padding them beyond a grid; and
-the number of voxels of a box in the world.
+limits on their sizes.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from . import check
-from .constants import MAX_EXTENT
+from .constants import MAX_VOXELS
 
 Zyx = Sequence[int]
 
@@ -89,25 +89,20 @@ def group_rows(positions: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     return positions[starts], np.split(order, later_starts)[: len(order)]
 
 
-def extent_of(context: str, extent: int | Sequence[int]) -> tuple[int, int, int]:
-    """Returns voxels along x, y, z, given these or one number for all; ValueError otherwise."""
-    sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
-    if len(sizes) != 3:
-        raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
-    x, y, z = (check.integer(context, "extent", size, low=1, high=MAX_EXTENT) for size in sizes)
-    return x, y, z
+def check_extent(
+    context: str, shape: Sequence[int], *, what: str = "extent", max_values: int = MAX_VOXELS
+) -> None:
+    """Raises ValueError unless all sizes are positive and their product is at most `max_values`.
 
-
-def extent_in(
-    context: str, extent: int | Sequence[int], box: Sequence[Sequence[float]]
-) -> tuple[int, int, int]:
-    """Returns an extent (x, y, z) as it is. A single number is the extent along the box's longest
-    side; the others are chosen so that voxels are cubes, or nearly so. ValueError if it is neither.
+    Readers call it with the sizes in a file's header, before they allocate memory.
     """
-    sizes = extent_of(context, extent)
-    if isinstance(extent, Sequence):
-        return sizes
-    low, high = check.box(context, box)
-    sides = [b - a for a, b in zip(low, high, strict=True)]
-    x, y, z = (max(1, round(sizes[0] * side / max(sides))) for side in sides)
-    return x, y, z
+    sizes = " x ".join(str(size) for size in shape)
+    if any(size < 1 for size in shape):
+        raise ValueError(f"{context}: {what} must be at least 1 in every direction, got {sizes}")
+    voxels = math.prod(int(size) for size in shape)
+    if voxels > max_values:
+        destination = "in memory at once" if max_values == MAX_VOXELS else "into a store"
+        raise ValueError(
+            f"{context}: {what} {sizes} is {voxels} voxels, "
+            f"more than the {max_values} that fit {destination}"
+        )

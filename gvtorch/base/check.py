@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .constants import MAX_EXTENT
 from .messages import one_line
 
 Kind = TypeVar("Kind")
@@ -363,6 +364,30 @@ def box(context: str, value: Any) -> tuple[tuple[float, float, float], tuple[flo
     sides = [b - a for a, b in zip(low, high, strict=True)]
     triple(context, "sides of the box", sides, positive=True)
     return low, high
+
+
+def extent_of(context: str, extent: int | Sequence[int]) -> tuple[int, int, int]:
+    """Returns voxels along x, y, z, given these or one number for all; ValueError otherwise."""
+    sizes = tuple(extent) if isinstance(extent, Sequence) else (extent,) * 3
+    if len(sizes) != 3:
+        raise ValueError(f"{context}: extent must be a number or (x, y, z), got {extent!r}")
+    x, y, z = (integer(context, "extent", size, low=1, high=MAX_EXTENT) for size in sizes)
+    return x, y, z
+
+
+def extent_in(
+    context: str, extent: int | Sequence[int], corners: Sequence[Sequence[float]]
+) -> tuple[int, int, int]:
+    """Returns an extent (x, y, z) as it is. A single number is the extent along a box's longest
+    side; the others are chosen so that voxels are cubes, or nearly so. ValueError if it is neither.
+    """
+    sizes = extent_of(context, extent)
+    if isinstance(extent, Sequence):
+        return sizes
+    low, high = box(context, corners)
+    sides = [b - a for a, b in zip(low, high, strict=True)]
+    x, y, z = (max(1, round(sizes[0] * side / max(sides))) for side in sides)
+    return x, y, z
 
 
 def grid_placement(

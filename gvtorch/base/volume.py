@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from . import check
-from . import constants as config
+from .boxes import check_extent
 from .image_info import ImageInfo
 from .labels import check_narrowed, counted, stored_labels
 
@@ -31,25 +30,6 @@ CHANNEL_DTYPES = (
 _NUMPY_FLOATS = (torch.float16, torch.float32, torch.float64)
 #: The viewing directions of `Volume.directional`, in the order of its numbers.
 DIRECTIONS = ("+x", "-x", "+y", "-y", "+z", "-z")
-
-
-def check_extent(
-    context: str, shape: Sequence[int], *, what: str = "extent", max_values: int = config.MAX_VOXELS
-) -> None:
-    """Raises ValueError unless all sizes are positive and their product is at most `max_values`.
-
-    Readers call it with the sizes in a file's header, before they allocate memory.
-    """
-    sizes = " x ".join(str(size) for size in shape)
-    if any(size < 1 for size in shape):
-        raise ValueError(f"{context}: {what} must be at least 1 in every direction, got {sizes}")
-    voxels = math.prod(int(size) for size in shape)
-    if voxels > max_values:
-        destination = "in memory at once" if max_values == config.MAX_VOXELS else "into a store"
-        raise ValueError(
-            f"{context}: {what} {sizes} is {voxels} voxels, "
-            f"more than the {max_values} that fit {destination}"
-        )
 
 
 class Volume:

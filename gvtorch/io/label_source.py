@@ -11,14 +11,17 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..base import boxes
 from ..base.labels import NARROW, as_whole, distinct, index_dtype, indices
-from ..base.stage import Progress
 from .resources import cores, run_ahead
 from .source import Index, MemorySource, VolumeSource
+
+if TYPE_CHECKING:  # not at run time: it imports torch, which workers of a conversion do without
+    from ..base.stage import Progress
 
 LABELS = "labels.npy"  # in the hidden folder of an unfinished store
 _CUBE_SIDE = 128  # voxels along a side of a region that is read at once

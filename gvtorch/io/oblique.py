@@ -17,9 +17,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..base import boxes, check
+from ..base import boxes
+from ..base.downsample import round_array
 from ..base.image_info import Rows
-from ..pool.downsample import round_array
 from .source import Index, VolumeSource
 
 Oblique = Literal["resample", "keep"]
@@ -141,6 +141,8 @@ def straighten(
         ValueError: `oblique` is something else.
         OSError: The smallest value can't be read.
     """
+    from ..base import check  # imports torch, which workers of a conversion do without
+
     if oblique is not None:
         check.one_of(source.path, "oblique", oblique, get_args(Oblique))
     if source.oblique is None:

@@ -17,8 +17,9 @@ import numpy as np
 
 from ..base import check
 from ..base.arrays import ArrayLike, as_volume
+from ..base.boxes import check_extent
 from ..base.constants import MAX_VOXELS
-from ..base.volume import Volume, check_extent
+from ..base.volume import Volume
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten

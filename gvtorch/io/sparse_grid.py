@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base import boxes
+from ..base.boxes import check_extent
 from ..base.image_info import ChannelInfo, ImageInfo
-from ..base.volume import check_extent
 from .source import Index, VolumeSource, place_axes
 
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf

@@ -13,8 +13,8 @@ import numpy as np
 
 from ..base import check
 from ..base.boxes import Zyx
+from ..base.downsample import pool_mean
 from ..base.volume import Volume, to_numpy
-from ..pool.downsample import pool_mean
 from .stores.store import Store
 
 _SAMPLE_VOXELS = 2**22  # voxels in the sample

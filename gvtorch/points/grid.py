@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..base import check
-from ..base.boxes import extent_in
+from ..base.check import extent_in
 from ..base.constants import MAX_BRANCHING
 from ..ops.splat import shares
 from .points import Points

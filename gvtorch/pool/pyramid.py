@@ -2,7 +2,7 @@
 resident tree, the plan of its nodes.
 
 Every level is made from the level below as it is stored, rounded to its dtype, so a level can also
-be made part by part, out of core, with the same bits; see downsample.py for the filters.
+be made part by part, out of core, with the same bits; see base/downsample.py for the filters.
 """
 
 from __future__ import annotations
@@ -15,11 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import CONSTANT, EMPTY, TERMINAL
-from ..base.labels import background
-from ..base.stage import Progress, no_progress
-from ..base.volume import Volume, movable
-from ..ops import cut_bricks
-from .downsample import (
+from ..base.downsample import (
     Grid,
     as_grid,
     by_node,
@@ -30,6 +26,10 @@ from .downsample import (
     pool_mean,
     pool_min,
 )
+from ..base.labels import background
+from ..base.stage import Progress, no_progress
+from ..base.volume import Volume, movable
+from ..ops import cut_bricks
 from .pools import BrickPool, NodePool
 
 _BATCH_BRICKS = {"cpu": 4096, "cuda": 1 << 15}  # bricks cut from a level at a time

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
+from ..base.downsample import by_node, extend, from_grid, pool_max, pool_min, reduce_windows
 from ..base.volume import movable, to_numpy
-from .downsample import by_node, extend, from_grid, pool_max, pool_min, reduce_windows
 from .pools import BrickPool, NodePool
 from .pyramid import NodeSummary, coarser, constant_and_empty, node_reduction
 

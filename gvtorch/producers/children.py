@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.downsample import from_grid
 from ..base.rows import distinct_rows
 from ..base.volume import to_numpy
 from ..pool import Channel
-from ..pool.downsample import from_grid
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
 from .answer import checked_bricks, checked_regions, raise_first

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
-from ..base.boxes import extent_in, extent_of
+from ..base.check import extent_in, extent_of
 from ..base.constants import DEEP_VOXELS
 from ..base.messages import one_line
 from ..fields import Distance, Field, Interval, Solid

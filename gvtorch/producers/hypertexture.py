@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
-from ..base.boxes import extent_in
+from ..base.check import extent_in
 from ..fields import Distance, noise
 from ..fields.noise.fractal import EvaluationCounter, Octave, octaves_of
 from ..pool import Channel

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.boxes import extent_of
+from ..base.check import extent_of
 from ..base.constants import MAX_BRANCHING
 from ..base.rows import distinct_rows
 from ..base.volume import Volume, movable

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
 import os
 import subprocess
 import warnings
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,6 +31,23 @@ def shared(path: str) -> Path:
     if not file.exists():
         pytest.skip(ABSENT + path)
     return file
+
+
+class Library:
+    """A library that test files name at their top. It is imported when it is first used: each of
+    the processes that run tests imports every file, but not many of them use all libraries.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Skips the test file if the library is not installed."""
+        self._name = name
+        if importlib.util.find_spec(name.partition(".")[0]) is None:
+            pytest.skip(f"{name} is not installed", allow_module_level=True)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # pytest asks every object of a test file
+            raise AttributeError(name)
+        return getattr(importlib.import_module(self._name), name)
 
 
 def resident_bytes() -> int:

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ...base.volume import check_extent
+from ...base.boxes import check_extent
 from ..dicom_codecs import plugin_of
 from ..dicom_frames import DicomFrame, frames_of, image_info, order_frames
 from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from ...base.boxes import check_extent
 from ...base.image_info import ImageInfo, color_channels
-from ...base.volume import check_extent
 from ..picture_size import has_jpeg_end, picture_size
 from ..resources import check_memory
 from ..source import Index, VolumeSource, convert_errors

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ...base import check
 from ..source import ArraySource
 from .format import Format
 
@@ -29,6 +28,8 @@ def open_raw(
     name, as in `scan_512x512x300_int16.raw`, little endian unless that says "be". If `offset`, the
     bytes of a header to skip, is given, other bytes may also follow the numbers.
     """
+    from ...base import check  # imports torch, which workers of a conversion do without
+
     name_match = _NAME.search(Path(path).name.lower())
     if shape is None:
         if name_match is None:

@@ -21,8 +21,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ...base.boxes import check_extent
 from ...base.image_info import ChannelInfo, ImageInfo
-from ...base.volume import check_extent
 from ..packed import unpack_block
 from ..source import ArraySource, Index, VolumeSource, number_type, place_axes
 from ..text_source import TextSource, text_numbers

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...base import check
-from ...base.volume import Volume
+from ...base.volume import Volume, movable
 from .. import resources
 from ..label_source import IndexSource
 from ..oblique import Oblique, StraightSource
@@ -290,7 +290,8 @@ def _fingerprint(user_source: Any, source: VolumeSource, target: Path) -> list[A
     if fingerprint is not None:
         return fingerprint
     if isinstance(user_source, Volume):
-        return unfinished.fingerprint(user_source)
+        data = movable(user_source.data).cpu().numpy()
+        return [list(data.shape), str(user_source.data.dtype), unfinished.checksum([data])]
     is_file = isinstance(user_source, (str, Path))
     fields: list[Any] = [list(source.shape), source.stored]
     fields = unfinished.fingerprint(source.path, target) if is_file else fields

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ...base import boxes, check
+from ...base import boxes
 from ...base.boxes import Zyx
+from ...base.downsample import pool_majority, pool_mean
 from ...base.image_info import ImageInfo
 from ...base.labels import background, check_narrowed
-from ...pool.downsample import pool_majority, pool_mean
 from ..source import check_time
 from .chunk_files import ChunkFiles, begin_read, files_of
 from .ngff import ImageArray, MultiscaleImage, read_json
@@ -144,6 +144,8 @@ def _channel_index(
     check_time(context, time, times)
     if channels is None:
         return slice(None)
+    from ...base import check  # imports torch, which workers of a conversion do without
+
     selected = list(check.instance(context, "channels", channels, tuple, list, range))
     if not selected or not all(isinstance(c, int) and 0 <= c < width for c in selected):
         raise ValueError(f"{context}: has no channels {selected!r}; it has {width}, from 0")

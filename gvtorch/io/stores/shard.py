@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ...base import boxes
-from ...pool.downsample import Reduction, pool_max, pool_mean, pool_min, reduce_windows, round_array
+from ...base.downsample import Reduction, pool_max, pool_mean, pool_min, reduce_windows, round_array
 from ..source import VolumeSource
 from .block_reader import needed_cells
 from .checksums import shard_checksums

@@ -18,7 +18,6 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from ...base.image_info import ImageInfo
-from ...base.volume import Volume, movable
 from ...base.whole_file import durable_file, name_in_errors, rename
 from ..remote import content_version
 from .checksums import CHECKSUMS_FILE, FileChecksums, json_checksum
@@ -254,14 +253,11 @@ def checksum(arrays: Iterable[np.ndarray]) -> int:
     return total
 
 
-def fingerprint(source: str | Path | Volume, target: Path | None = None) -> list[Any]:
-    """Returns a source's sizes and modification times, or a checksum, or what identifies the
-    version of a file that was downloaded: equal while unchanged.
+def fingerprint(source: str | Path, target: Path | None = None) -> list[Any]:
+    """Returns the sizes and modification times of a file or folder, or what identifies the version
+    of a file that was downloaded: equal while unchanged.
     `target`, a store that may lie in a source's folder, does not count.
     """
-    if isinstance(source, Volume):
-        data = movable(source.data).cpu().numpy()
-        return [list(data.shape), str(source.data.dtype), checksum([data])]
     text = str(source)
     if "://" in text:
         return [text]

@@ -6,6 +6,7 @@ of labels, `pool_directional` that of volumes with six directions, see `Volume.d
 
 All functions take (z, y, x, c) grids. Each gives the same bits on any part of an array whose corner
 is a multiple of the factor as on the whole, so volumes can also be converted part by part.
+The worker processes of a conversion import this file: it imports torch only for tensors.
 Source: Crassin et al., "GigaVoxels", I3D 2009, section 3 (mip-mapped bricks); Williams, "Pyramidal
     parametrics", 1983; Crassin et al., "Interactive indirect illumination using voxel cone
     tracing", CGF 2011 (anisotropic voxels).
@@ -17,21 +18,19 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from ..base.volume import DIRECTIONS, to_numpy
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
 
 Factors = Sequence[int]  # z y x
 Reduction = Literal["min", "max", "mean"]
 #: Arrays; or tensors of a dtype that torch can compare and add up: not uint16, nor bfloat16.
-Grid = TypeVar("Grid", np.ndarray, Tensor)
+Grid = TypeVar("Grid", np.ndarray, "Tensor")
 
-_NUMPY_OPERATIONS = {"min": np.minimum, "max": np.maximum, "mean": np.add}
-_TORCH_OPERATIONS = {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}
 #: Voxels reduced at a time, so that intermediate arrays stay in a core's cache.
 _SLAB_VOXELS = 1 << 22
 _DEVICE_SLAB_VOXELS = 1 << 27  # the same on a device: more would take more memory and no less time
@@ -39,6 +38,10 @@ _DEVICE_SLAB_VOXELS = 1 << 27  # the same on a device: more would take more memo
 
 def as_grid(values: Tensor) -> Any:
     """Returns voxels as a `Grid`: an array of those on the host, a tensor of others."""
+    import torch
+
+    from .volume import to_numpy
+
     if values.device.type == "cpu":
         return to_numpy(values)
     wider = {torch.uint16: torch.int32, torch.bfloat16: torch.float32}
@@ -47,6 +50,8 @@ def as_grid(values: Tensor) -> Any:
 
 def from_grid(values: np.ndarray | Tensor, dtype: torch.dtype) -> Tensor:
     """Converts a grid back into a tensor of the dtype that `as_grid` took."""
+    import torch
+
     return torch.as_tensor(values).to(dtype)
 
 
@@ -137,7 +142,7 @@ def pool_directional(
 
     def reduce(part: np.ndarray, factors: Factors) -> np.ndarray:
         views = []
-        for direction in range(len(DIRECTIONS)):
+        for direction in range(values.shape[-1] // 4):
             axis = 2 - direction // 2
             rgba = part[..., 4 * direction : 4 * direction + 4].astype(np.float64)
             columns = list(range(factor))[:: 1 if direction % 2 == 0 else -1]
@@ -180,9 +185,11 @@ def extend(values: Grid, axis: int, before: int, after: int) -> Grid:
     if before == after == 0:
         return values
     index = np.arange(-before, values.shape[axis] + after).clip(0, values.shape[axis] - 1)
-    if isinstance(values, Tensor):
-        return values.index_select(axis, torch.from_numpy(index).to(values.device))
-    return values.take(index, axis)
+    if isinstance(values, np.ndarray):
+        return values.take(index, axis)
+    import torch
+
+    return values.index_select(axis, torch.from_numpy(index).to(values.device))
 
 
 def by_node(values: Grid, how: Reduction, brick_size: int, border: int) -> Grid:
@@ -211,10 +218,19 @@ def _reduce_axis(
     result = _cast(
         _strided(values, axis, 0, step, count), sum_dtype or _dtype_name(values), copy=True
     )
-    combine: Any = (_TORCH_OPERATIONS if isinstance(values, Tensor) else _NUMPY_OPERATIONS)[how]
+    combine = _combine(values, how)
     for k in range(1, size):
         combine(result, _strided(values, axis, k, step, count), out=result)
     return result
+
+
+def _combine(values: Grid, how: Reduction) -> Any:
+    """Returns the function of two grids, and of `out`, that reduces them."""
+    if isinstance(values, np.ndarray):
+        return {"min": np.minimum, "max": np.maximum, "mean": np.add}[how]
+    import torch
+
+    return {"min": torch.minimum, "max": torch.maximum, "mean": torch.add}[how]
 
 
 def _reduce_slabs(
@@ -224,10 +240,10 @@ def _reduce_slabs(
     factors = [factor] * 3 if isinstance(factor, int) else list(factor)
     shape = [-(-n // f) for n, f in zip(values.shape[:3], factors, strict=True)]
     shape.append(values.shape[3])
-    if isinstance(values, Tensor):
-        out, slab = values.new_empty(shape), _DEVICE_SLAB_VOXELS
-    else:
+    if isinstance(values, np.ndarray):
         out, slab = np.empty(shape, values.dtype), _SLAB_VOXELS
+    else:
+        out, slab = values.new_empty(shape), _DEVICE_SLAB_VOXELS
     rows = max(1, slab // max(1, math.prod(values.shape[1:]) * factors[0]))
     for start in range(0, shape[0], rows):
         part = values[start * factors[0] : (start + rows) * factors[0]]
@@ -258,9 +274,11 @@ def _dtype_name(values: Grid) -> str:
 
 def _cast(values: Grid, name: str, *, copy: bool = False) -> Grid:
     """Returns a grid in the dtype of a name."""
-    if isinstance(values, Tensor):
-        return values.to(getattr(torch, name), copy=copy)
-    return values.astype(name, copy=copy)
+    if isinstance(values, np.ndarray):
+        return values.astype(name, copy=copy)
+    import torch
+
+    return values.to(getattr(torch, name), copy=copy)
 
 
 def _divide(total: Grid, count: int) -> Grid:
@@ -269,9 +287,9 @@ def _divide(total: Grid, count: int) -> Grid:
     """
     if "int" in _dtype_name(total):
         total = _cast(total, "float64")
-    if isinstance(total, Tensor):
-        return total / torch.full((), count, dtype=total.dtype, device=total.device)
-    return total / total.dtype.type(count)
+    if isinstance(total, np.ndarray):
+        return total / total.dtype.type(count)
+    return total / total.new_full((), count)
 
 
 def _sum_dtype(name: str, terms: int) -> str:
