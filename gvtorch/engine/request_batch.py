@@ -235,14 +235,12 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
 
 def _default_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
     """Returns (k, 2, c) ranges not given: constants (k, c) of CONSTANT nodes, else the dtype's."""
-    channel = cache.bricks.channels[name]
-    shape, dtype, device = (len(kind), channel.width), channel.dtype, kind.device
-    limits = [torch.full(shape, limit, dtype=dtype, device=device) for limit in channel.limits]
-    ranges = torch.stack([movable(limit) for limit in limits], 1)
-    if constant is not None:
-        uniform = (kind == Region.CONSTANT)[:, None, None]
-        ranges = torch.where(uniform, movable(constant)[:, None].expand(-1, 2, -1), ranges)
-    return ranges.view(channel.dtype)
+    ranges = cache.bricks.channels[name].unknown_range(len(kind), device=kind.device)
+    if constant is None:
+        return ranges
+    uniform = (kind == Region.CONSTANT)[:, None, None]
+    rows = torch.where(uniform, movable(constant)[:, None].expand(-1, 2, -1), movable(ranges))
+    return rows.view(ranges.dtype)
 
 
 def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBatch, Bricks]]:

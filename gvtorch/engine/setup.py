@@ -284,8 +284,9 @@ def _fill_root(cache: Cache, source: ProducedTree) -> None:
     root = Nodes(loc, source.layout, coarse=bool(cache.finest[tile] > 0))
     regions = checked_regions(source.wait(producer.classify(root)), root, producer)
     raise_first(regions.errors)
-    for channel, tensor in regions.ranges.items():
-        movable(nodes.ranges[channel])[tile, 0] = movable(tensor)[0]
+    for channel, stored in nodes.ranges.items():
+        unknown = cache.bricks.channels[channel].unknown_range(1, device=stored.device)
+        movable(stored)[tile, 0] = movable(regions.ranges.get(channel, unknown))[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
         bricks = checked_bricks(source.wait(producer.fill(root)), root, producer)
