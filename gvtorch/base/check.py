@@ -27,10 +27,13 @@ Kind = TypeVar("Kind")
 
 
 def describe(tensor: Any) -> str:
-    """Returns shape, dtype and device of a tensor as one phrase, or the type of anything else."""
+    """Returns shape, dtype and device of a tensor as one phrase, with its layout unless dense; or
+    the type of anything else.
+    """
     if not isinstance(tensor, Tensor):
         return type(tensor).__name__
-    return f"{as_text(tensor)} on {tensor.device}"
+    layout = "" if tensor.layout == torch.strided else f", {tensor.layout}"
+    return f"{as_text(tensor)} on {tensor.device}{layout}".replace("torch.", "")
 
 
 def summary(record: Any) -> str:

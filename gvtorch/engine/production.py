@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from ..base.messages import one_line
 from ..base.stage import stage
 from ..cache import KINDS, Cache, RequestList, Scheduler, write
 from ..cache.requests import Requests, coarser_requests, extra_levels, levels_wanted, requests_below
@@ -82,7 +83,7 @@ class Failures:
 
     def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Records the nodes of a batch as failed."""
-        tree, text = batch.source.name, " ".join(message.split())
+        tree, text = batch.source.name, one_line(message or "no reason given")
         kind = next(name for name, kind in KINDS.items() if kind == batch.kind)
         for loc in map(tuple, batch.targets.loc.tolist()):
             self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
