@@ -226,7 +226,8 @@ class Volume:
         if not self.info.labels:
             return {}
         table = self.label_values
-        label_numbers = movable(self.data).unique().to(torch.int64) if table is None else table
+        stored = self.data.to(torch.int32)  # torch can't compare uint16
+        label_numbers = stored.unique().to(torch.int64) if table is None else table
         note = "" if table is None else "; the other numbers are places in their list"
         return {"labels": f"{counted(label_numbers)}{note}"}
 

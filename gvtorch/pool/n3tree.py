@@ -298,6 +298,9 @@ class N3Tree:
         """Returns the tree with its pools on a device; tensors already there are shared."""
         device, other = check.device("N3Tree.to", device), copy.copy(self)
         other.nodes, other.bricks = self.nodes.to(device), self.bricks.to(device)
+        if device != self.device:  # its content may be edited separately
+            other.value_range, other.made_of = dict(self.value_range), dict(self.made_of)
+            other.turns = Turns()
         return other
 
     def to_volume(self, channel: str | None = None) -> Volume:
@@ -347,7 +350,7 @@ class N3Tree:
             corners = check.reals("N3Tree.refresh", "box", box, (2, 3))
             if not bool((corners[0] <= corners[1]).all()):
                 raise ValueError(f"N3Tree.refresh: box must be low and high corner, got {box!r}")
-            corner_voxels = ((corners - self.box[0]) / torch.tensor(self.spacing)).tolist()
+            corner_voxels = ((corners - self.box[0]) / corners.new_tensor(self.spacing)).tolist()
             sizes = zip(*corner_voxels, self.extent, strict=True)
             spans = [(max(0, math.floor(a)), min(n, math.floor(b) + 1)) for a, b, n in sizes]
             low, high = (tuple(end) for end in zip(*spans, strict=True))
