@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.explicit import explicit
+from ..base.lasting import lasting
 from ..base.records import Hits, Rays
 from ..base.stage import Progress, no_progress
 from ..cameras import Camera
@@ -240,6 +241,7 @@ class Engine(FrameSteps):
 
     @explicit(RenderOptions)
     @_locked
+    @lasting
     def capture(
         self,
         camera: Camera | Rays,

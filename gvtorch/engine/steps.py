@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.lasting import lasting
 from ..base.records import Hits, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
@@ -37,6 +38,7 @@ _MAX_PRODUCED_BYTES = 256 * 10**6  # most bytes of voxels produced in one frame
 class FrameSteps:
     """The state of an engine, and the steps of its frames; see `Engine`, which documents both."""
 
+    @lasting
     def __init__(self, scene: Scene, options: EngineOptions) -> None:
         """Allocates the pools and makes the root of every tree."""
         self.options, self.lock = options, threading.RLock()

@@ -16,6 +16,7 @@ from ..base import check
 from ..base.constants import CONSTANT, MAX_BRANCHING, TERMINAL
 from ..base.image_info import ImageInfo
 from ..base.labels import background
+from ..base.lasting import lasting
 from ..base.stage import Progress, no_progress
 from ..base.turns import Turns
 from ..base.volume import Volume, movable
@@ -223,6 +224,7 @@ class N3Tree:
         self._check_words()
 
     @classmethod
+    @lasting
     def from_volume(
         cls,
         volume: Volume | Mapping[str, Volume],
@@ -294,6 +296,7 @@ class N3Tree:
         tree.bricks.in_order()
         return tree
 
+    @lasting
     def to(self, device: torch.device | str) -> N3Tree:
         """Returns the tree with its pools on a device; tensors already there are shared."""
         device, other = check.device("N3Tree.to", device), copy.copy(self)
