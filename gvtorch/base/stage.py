@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -33,6 +33,13 @@ Mark = float | torch.cuda.Event
 
 def no_progress(what: str, done: int, total: int) -> None:
     """Shows nothing."""
+
+
+def check_progress(context: str, progress: Any) -> None:
+    """Raises ValueError unless a user's `progress` can be called."""
+    if not callable(progress):
+        got = type(progress).__name__
+        raise ValueError(f"{context}: progress must be a function, got {got}")
 
 
 def mark(device: torch.device) -> Mark:

@@ -17,7 +17,7 @@ from ..base import check
 from ..base.explicit import explicit
 from ..base.lasting import lasting
 from ..base.records import Hits, Rays
-from ..base.stage import Progress, no_progress
+from ..base.stage import Progress, check_progress, no_progress
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..io.http import retry_refused
@@ -116,6 +116,7 @@ class Engine(FrameSteps):
             ValueError: An argument is of the wrong type or out of its range.
             ProductionError: A node can't be produced, and the engine is strict.
         """
+        check_progress("frame", progress)
         view = self.view("frame", camera, shader, options)
         with self.new_frame(view.options) as stats:
             self.serve_last_frame(stats)  # choose requests, produce, take slots, write, link
@@ -177,6 +178,7 @@ class Engine(FrameSteps):
             ValueError: The mode is unknown, or see `frame`.
             ProductionError: See `frame`.
         """
+        check_progress("render", progress)
         check.integer("render", "productions", productions, low=1)
         check.integer("render", "max_frames", max_frames, low=1)
         check.one_of("render", "mode", mode, ("interactive", "balanced", "converge"))

@@ -44,13 +44,18 @@ def device_of(backend: str) -> torch.device:
     return torch.device("cuda" if on_cuda else "cpu")
 
 
-@functools.cache
 def choose_backend(backend: str, device: torch.device) -> str:
     """Returns the backend to run on `device`; `auto` is the compiled one where it is available.
 
     Raises:
         ValueError: The backend is unknown, can't be used here, or does not run on `device`.
     """
+    choose = _cached_backend if isinstance(backend, str) else uncached_backend
+    return choose(backend, device)
+
+
+def uncached_backend(backend: str, device: torch.device) -> str:
+    """Does what `choose_backend` does, for torch.compile, which warns of caches."""
     if backend not in ("auto", "reference", "cpp", "cuda"):
         raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
     compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
@@ -64,7 +69,7 @@ def choose_backend(backend: str, device: torch.device) -> str:
     return backend
 
 
-uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
+_cached_backend = functools.cache(uncached_backend)
 
 
 def runs_twin(backend: str, *tensors: Tensor) -> bool:

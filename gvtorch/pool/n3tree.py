@@ -17,7 +17,7 @@ from ..base.constants import CONSTANT, MAX_BRANCHING, TERMINAL
 from ..base.image_info import ImageInfo
 from ..base.labels import background
 from ..base.lasting import lasting
-from ..base.stage import Progress, no_progress
+from ..base.stage import Progress, check_progress, no_progress
 from ..base.turns import Turns
 from ..base.volume import Volume, movable
 from ..ops import locate
@@ -260,6 +260,7 @@ class N3Tree:
 
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
+        check_progress("from_volume", progress)
         originals = volumes_by_channel("from_volume", volume)
         device = check.device("from_volume", device)
         build_device = choose_build_device(originals.values(), device)
