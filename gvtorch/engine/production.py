@@ -5,6 +5,7 @@ and not asked for again; its ancestors stand in for it, and other nodes are not 
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -64,7 +65,9 @@ class Failure:
 
 
 class Failures:
-    """All nodes that failed, by loc, because a node's tile may be given away and come back."""
+    """All nodes that failed, by loc, because a node's tile may be given away and come back. Any
+    thread in which an answer arrives may add some.
+    """
 
     def __init__(self, strict: bool) -> None:
         self.strict = strict
@@ -72,6 +75,7 @@ class Failures:
         self._failed: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
         self._first_failure: tuple[Failure, BaseException | None] | None = None
         self._last_count = 0
+        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._failed)
@@ -85,10 +89,11 @@ class Failures:
         """Records the nodes of a batch as failed."""
         tree, text = batch.source.name, one_line(message or "no reason given")
         kind = next(name for name, kind in KINDS.items() if kind == batch.kind)
-        for loc in map(tuple, batch.targets.loc.tolist()):
-            self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
-            self._failed.add((tree, batch.kind, loc))
-        self._first_failure = self._first_failure or (self.newest[-1], cause)
+        with self._lock:
+            for loc in map(tuple, batch.targets.loc.tolist()):
+                self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
+                self._failed.add((tree, batch.kind, loc))
+            self._first_failure = self._first_failure or (self.newest[-1], cause)
 
     def among(self, batch: RequestBatch) -> Tensor | None:
         """Returns (k,) bool, which nodes of a batch failed before; None if none did."""
@@ -102,17 +107,19 @@ class Failures:
         """Raises `ProductionError` for the first failure since the last call, if strict: at the end
         of a frame, when the pools are consistent.
         """
-        first_failure, self._first_failure = self._first_failure, None
+        with self._lock:
+            first_failure, self._first_failure = self._first_failure, None
         if self.strict and first_failure is not None:
             failure, cause = first_failure
             raise ProductionError(str(failure)) from cause
 
     def forget(self, tree: str | None = None) -> None:
         """Forgets the failures of a tree, or all."""
-        kept_failures = [failure for failure in self.newest if tree not in (None, failure.tree)]
-        self.newest.clear()
-        self.newest.extend(kept_failures)
-        self._failed = {node for node in self._failed if tree not in (None, node[0])}
+        with self._lock:
+            kept_failures = [failure for failure in self.newest if tree not in (None, failure.tree)]
+            self.newest.clear()
+            self.newest.extend(kept_failures)
+            self._failed = {node for node in self._failed if tree not in (None, node[0])}
 
 
 @dataclass(frozen=True, eq=False)
