@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import threading
 import time
+import weakref
 from concurrent.futures import Future
 from typing import Any
 
@@ -101,6 +103,54 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
             if stats.converged:
                 break
         assert stats.converged and engine.render(view(24), TRANSFER).stats.produced["bricks"] == 0
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_graph_that_is_dropped_gives_its_buffers_and_its_nodes_back(blobs, backend):
+    producer = Later(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        frames.served.graph = weakref.ref(frames)
+        buffers = weakref.ref(frames.served._uploads[0])
+        producer.late = []
+        while not producer.late:
+            frames.frame()
+        producer.late, late = None, producer.late
+        del frames
+        assert engine.render(view(24), TRANSFER).stats.produced["bricks"] > 0
+        assert not engine.host_frames
+        for future, bricks in late:
+            future.set_result(bricks)
+        late.clear()
+        del future
+        gc.collect()
+        assert buffers() is None
+        engine.validate()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_closed_engine_asks_for_nothing_more(blobs, backend):
+    class Slow(gv.VolumeProducer):
+        asked, gate, calls = threading.Event(), threading.Event(), 0
+
+        def fill(self, nodes):
+            if threading.current_thread().name.startswith("gvtorch-ask"):
+                self.calls += 1
+                self.asked.set()
+                self.gate.wait()
+                raise RuntimeError("its files are closed")
+            return super().fill(nodes)
+
+    producer = Slow(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        while not Slow.asked.is_set():
+            frames.frame()
+            time.sleep(0.01)
+        asker = engine.host_frames[0]._executor
+    Slow.gate.set()
+    asker.shutdown()  # waits for its thread
+    assert producer.calls == 1
 
 
 @pytest.mark.parametrize("backend", COMPILED)

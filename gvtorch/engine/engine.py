@@ -7,6 +7,7 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial, wraps
 from typing import Any, Literal, TypeVar, Unpack, cast
@@ -307,9 +308,11 @@ class Engine(FrameSteps):
                 f"Engine.capture: {'fit' if fit else 'look_ahead'} needs replays that serve: all "
                 "producers on_device, or all on_host, without coarse channels"
             )
+        graph = FrameGraph(self, view, recorded, render_frame, look_ahead)
         if isinstance(recorded, HostFrame):
+            recorded.graph = weakref.ref(graph)
             self.host_frames.append(recorded)
-        return FrameGraph(self, view, recorded, render_frame, look_ahead)
+        return graph
 
     @cached_property
     def box(self) -> Tensor:

@@ -54,7 +54,12 @@ class HostFrame(RecordedFrame):
     several frames at once, so that it catches up. If an answer takes longer than `_CALL_GAP`, it
     calls without waiting: one slow read delays nothing else. The thread in which an answer arrives
     checks and queues it; the next frame sends all queued answers, and writes them.
+
+    Attributes:
+        graph: Weak reference to the graph that replays it; None: there is no graph.
     """
+
+    graph: Callable[[], object] | None = None
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
         super().__init__(production, batch, fit)
@@ -113,8 +118,15 @@ class HostFrame(RecordedFrame):
             self._asked_count = self._failed_count = 0
         self._production.restore_pending()
 
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody can replay it any more."""
+        return self.graph is not None and self.graph() is None
+
     def close(self) -> None:
-        """Ends the thread that asks producers."""
+        """Ends the thread that asks producers; it asks for nothing more."""
+        with self._lock:
+            self.generation += 1
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def serve(self) -> None:
@@ -232,7 +244,11 @@ class HostFrame(RecordedFrame):
                     self._submit(RequestBatch(source, kind, targets, generation=generation))
 
     def _submit(self, batch: RequestBatch) -> None:
-        """Asks for a batch; if the producer raises, asks again for each half."""
+        """Asks for a batch; if the producer raises, asks again for each half. One of an earlier
+        generation is dropped.
+        """
+        if batch.generation != self.generation:
+            return
 
         def on_arrival(future: Future) -> None:
             with self._lock:

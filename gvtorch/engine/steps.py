@@ -151,10 +151,15 @@ class FrameSteps:
         self._missed = None
 
     def release(self, keep: RecordedFrame | None = None) -> None:
-        """Drops the answers that are on their way to captured frames, except those of `keep`."""
-        for host_frame in self.host_frames:
+        """Drops the answers that are on their way to captured frames, except those of `keep`, and
+        the frames whose graphs are gone, with their buffers.
+        """
+        for host_frame in list(self.host_frames):
             if host_frame is not keep:
                 host_frame.release()
+            if host_frame.abandoned:
+                host_frame.close()
+                self.host_frames.remove(host_frame)
 
     def scout(self, view: View, stats: FrameStats) -> None:
         """Traces some rays before the picture: while answers are written at once, some rays that
