@@ -281,6 +281,18 @@ def test_the_root_is_waited_for_as_long_as_the_producer_says(patience):
     pool.shutdown()
 
 
+@pytest.mark.parametrize(
+    ("own", "part", "expected"), [(None, 5.0, 7.0), (None, 9.0, 9.0), (1.0, 5.0, 1.0)]
+)
+def test_joined_producers_are_as_patient_as_the_most_patient_part(own, part, expected):
+    """A part without a patience of its own has the engine's."""
+    parts = {"a": Ball(), "b": Ball()}
+    joined = gv.JoinedProducer(parts)
+    joined.patience, parts["a"].patience = own, part
+    with gv.Engine(joined, patience=7, **SIZE) as engine:
+        assert engine.trees["scene"].patience == expected
+
+
 @pytest.mark.backend("cpp")
 def test_an_answer_for_a_node_that_is_gone_is_dropped():
     """Futures that finish after their tile was evicted do no harm."""

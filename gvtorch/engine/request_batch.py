@@ -46,8 +46,7 @@ class ProducedTree:
     @property
     def patience(self) -> float:
         """Seconds after which an answer that has not come is given up."""
-        producer_patience = self.producer.patience
-        return self.engine_patience if producer_patience is None else producer_patience
+        return self.producer.patience_in(self.engine_patience)
 
     def wait(self, answer: Any) -> Any:
         """Returns the producer's answer; waits for a future, at most for `patience`."""

@@ -182,7 +182,7 @@ class Producer(torch.nn.Module):
 
     Attributes:
         patience: Seconds after which an answer that has not come counts as failed; None: the
-            engine's.
+            engine's, or the longest of the producers that it is made of.
         layout: Set by the engine that uses this producer; otherwise None.
         on_device: Whether `classify` and `fill` take and return only tensors on the engine's
             device, and never make the host wait or copy from host memory, so that `Engine.capture`
@@ -297,6 +297,10 @@ class Producer(torch.nn.Module):
             included if `nodes.coarse` is true, and only then.
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not implemented")
+
+    def patience_in(self, engine_patience: float) -> float:
+        """Returns `patience`; or, where that is None, the engine's."""
+        return engine_patience if self.patience is None else self.patience
 
     def changed(self, where: ChangeTest | Tensor | Sequence[Any] | None = None) -> None:
         """Declares that the content has changed, for example to another time: in its next frame the
@@ -459,6 +463,12 @@ class OfProducers(Producer):
     def host_bytes(self) -> int:  # type: ignore[override]
         """The sum over all parts."""
         return sum(part.host_bytes for part in self.parts().values())
+
+    def patience_in(self, engine_patience: float) -> float:
+        """Returns `patience`; or, where that is None, the longest of the parts."""
+        if self.patience is not None:
+            return self.patience
+        return max(part.patience_in(engine_patience) for part in self.parts().values())
 
     def changed(self, where: Any = None) -> None:
         """See `Producer.changed`; calls it for all parts."""
