@@ -167,17 +167,21 @@ class N3Tree:
 
     def nearest(self, loc: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (k,) int64 nodes with locs (k, 4) x, y, z, depth, or their nearest ancestors that
-        exist, and (k,) bool, whether it is the node itself.
+        exist, and (k,) bool, whether it is the node itself. A loc that no node of the tree can have
+        gives the root and False.
         """
-        n, node = self.branching, torch.full_like(loc[:, 0], self.root)
-        exact = torch.ones_like(node, dtype=torch.bool)
+        check.tensor("N3Tree", "loc", loc, ("k", 4), torch.int64, self.device)
+        n, node, depth = self.branching, torch.full_like(loc[:, 0], self.root), loc[:, 3]
+        side = n ** depth.clamp(0, self.depth)
+        exact = ((loc[:, :3] >= 0) & (loc[:, :3] < side[:, None])).all(1)
+        exact &= (depth >= 0) & (depth <= self.depth)
         child = self.nodes.child_tn.view(-1)
-        for level in range(1, int(loc[:, 3].max()) + 1 if len(loc) else 0):
+        for level in range(1, int((depth * exact).max()) + 1 if len(loc) else 0):
             tile = child[node].to(torch.int64)
-            up = (loc[:, 3] - level).clamp(min=0)
+            up = (depth - level).clamp(0, self.depth)
             x, y, z = (loc[:, axis] // n**up % n for axis in range(3))
             child_node = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
-            deeper = level <= loc[:, 3]
+            deeper = level <= depth
             exact = exact & (~deeper | (tile >= 0))
             node = torch.where(deeper & exact, child_node, node)
         return node, exact
