@@ -172,8 +172,8 @@ class Engine(FrameSteps):
         Returns:
             The picture. Its `stats` are those of the last frame, except that times, produced,
             evicted and uploaded bytes are sums over all frames, and used tiles and bricks the
-            maximum of one frame. `capacity_exceeded`: rays had to be traced in subsets, or some
-            requests found no slot.
+            maximum of one frame. `capacity_exceeded` of a converging picture: rays had to be traced
+            in subsets.
 
         Raises:
             ValueError: The mode is unknown, or see `frame`.

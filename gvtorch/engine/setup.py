@@ -40,7 +40,7 @@ class EngineOptions:
         border: Voxels around a brick; with 1 or more no seam shows.
         loading: straight: directly to the wanted level; levels: level by level.
         order: coarse or fine: which levels are served first.
-        load_budget: Most bricks made in a frame.
+        load_budget: Most bricks made in a frame; never more than 256 MB of them.
         subdivide_budget: Most node tiles made in a frame.
         time_budget: Most milliseconds of production in a frame; None: no limit.
         scout_rounds: Most passes of scouts, each at most a sixteenth of the rays, before a picture
