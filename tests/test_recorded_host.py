@@ -17,6 +17,7 @@ from helpers.recorded import COMPILED, TRANSFER, Frames, view
 
 import gvtorch as gv
 from gvtorch.engine import host_frame, request_batch
+from gvtorch.engine.upload_queue import UploadQueue
 from gvtorch.io.stores.conversion import convert
 
 
@@ -312,3 +313,10 @@ def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
         engine.validate()
         locs = [failure.loc for failure in engine.failures]
         assert len(locs) == len(set(locs)) >= calls[0], "each is named once"
+
+
+def test_a_batch_larger_than_memory_is_refused_before_it_is_allocated(monkeypatch):
+    form = {"bricks": {"data": ((10, 10, 10, 1), torch.float32)}}
+    monkeypatch.setattr("os.sysconf", lambda _: 1000)
+    with pytest.raises(ValueError, match="a batch of 512 takes"):
+        UploadQueue(form, 512, torch.device("cpu"))

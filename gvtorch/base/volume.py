@@ -191,7 +191,8 @@ class Volume:
             raise ValueError(f"{context}: opacity must lie in 0 to 1, got {low:g} to {high:g}")
         color = color if premultiplied else color * opacity
         views = torch.cat((color, opacity), -1).to(dtype).repeat(1, 1, 1, len(DIRECTIONS))
-        volume = Volume(views, self.spacing, self.origin, name=self.name)
+        info = replace(self.info, channels=(), quantity=None, labels=False)
+        volume = Volume(views, self.spacing, self.origin, name=self.name, info=info)
         volume.filter = "directional"
         return volume
 
