@@ -146,8 +146,9 @@ class FrameSteps:
         for source in changed:
             self.production.forget(source)
             old_version, producer = self._versions[source.name], source.producer
+            version = producer.version  # another thread may change it further meanwhile
             renew_tree(self.cache, source, producer.changes(old_version))
-            self._versions[source.name] = producer.version
+            self._versions[source.name] = version
         self._missed = None
 
     def release(self, keep: RecordedFrame | None = None) -> None:

@@ -107,8 +107,9 @@ class FromChildren(OfProducers):
 
     def _drop_stale(self, layout: Layout) -> None:
         """Drops the blocks that have changed since they were made."""
+        version = self.producer.version  # another thread may change it further meanwhile
         changes, locs = self.producer.changes(self._cached_version), [*self._cache]
-        self._cached_version = self.producer.version
+        self._cached_version = version
         if changes is None or not locs:
             self._cache.clear()
             return

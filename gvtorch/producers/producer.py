@@ -8,6 +8,7 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import itertools
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -34,6 +35,7 @@ from .nodes import Layout, Nodes
 ChangeTest = Callable[[Nodes], Tensor]
 # Versions, shared by all producers: a later change has a larger one.
 _version_numbers = itertools.count(1)
+_version_lock = threading.Lock()  # any thread may declare a change
 _MAX_CHANGES = 64  # changes that are kept; if more are asked for, everything may have changed
 
 
@@ -325,12 +327,14 @@ class Producer(torch.nn.Module):
                     f"{context}: where must be low and high corners, got {boxes.tolist()}"
                 )
             where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
-        self.version = next(_version_numbers)
-        self._changes.append((self.version, where))
+        with _version_lock:
+            version = next(_version_numbers)
+            self._changes.append((version, where))
+            self.version = version
 
     def changes(self, since: int) -> list[ChangeTest] | None:
         """Returns functions that find the nodes changed since a version; None: any may have."""
-        newer = [finder for version, finder in self._changes if version > since]
+        newer = [finder for version, finder in list(self._changes) if version > since]
         finders = [finder for finder in newer if finder is not None]
         return finders if 0 < len(finders) == len(newer) < _MAX_CHANGES else None
 
