@@ -107,6 +107,33 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 
 
 @pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("how", ["failures forgotten", "frame broken off"])
+def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
+    """Nodes that are no longer marked as pending are asked for again."""
+    producer = Later(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]._executor
+        producer.late = []
+        while not producer.late:
+            frames.frame()
+            asker.submit(int).result()
+        asked = len(producer.late)
+        if how == "failures forgotten":
+            engine.forget_failures()
+        else:
+            with pytest.raises(KeyError), engine.new_frame(frames.view.options):
+                raise KeyError
+        while len(producer.late) == asked:
+            frames.frame()
+            asker.submit(int).result()
+        producer.late, late = None, producer.late
+        for future, bricks in late:
+            future.set_result(bricks)
+        frames.whole(pause=0.01)
+        engine.validate()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
 def test_a_graph_that_is_dropped_gives_its_buffers_and_its_nodes_back(blobs, backend):
     producer = Later(blobs)
     with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
@@ -320,3 +347,15 @@ def test_a_batch_larger_than_memory_is_refused_before_it_is_allocated(monkeypatc
     monkeypatch.setattr("os.sysconf", lambda _: 1000)
     with pytest.raises(ValueError, match="a batch of 512 takes"):
         UploadQueue(form, 512, torch.device("cpu"))
+
+
+def test_an_engine_that_is_closed_cancels_the_answers_on_their_way(blobs):
+    producer = Later(blobs)
+    with gv.Engine(producer, brick_size=4) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        producer.late = late = []
+        while not late:
+            frames.frame()
+            time.sleep(0.01)
+        engine.host_frames[0]._executor.submit(int).result()
+    assert all(future.cancelled() for future, _ in late)

@@ -329,7 +329,7 @@ class Engine(FrameSteps):
         """Lets failed nodes be requested again, and files that servers refused be read again."""
         retry_refused()
         self.production.failures.forget()
-        self.production.restore_pending()
+        self.restore_pending()
 
     def memory(self) -> dict[str, int]:
         """Returns bytes by name: content of each pool, and bookkeeping."""

@@ -124,9 +124,13 @@ class HostFrame(RecordedFrame):
         return self.graph is not None and self.graph() is None
 
     def close(self) -> None:
-        """Ends the thread that asks producers; it asks for nothing more."""
+        """Cancels the answers on their way, and ends the thread that asks for more."""
         with self._lock:
             self.generation += 1
+            futures = list(self._waiting)
+            self._waiting.clear()
+        for future in futures:
+            future.cancel()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def serve(self) -> None:

@@ -102,7 +102,7 @@ class FrameSteps:
             with collect_timings(self.device) if monitor else nullcontext() as timings:
                 yield stats
         except BaseException:
-            self.production.restore_pending()
+            self.restore_pending()
             raise
         end = mark(self.device)
 
@@ -161,6 +161,13 @@ class FrameSteps:
             if host_frame.abandoned:
                 host_frame.close()
                 self.host_frames.remove(host_frame)
+
+    def restore_pending(self) -> None:
+        """Marks the nodes whose answers are on their way as pending, and no others: answers to
+        captured frames are dropped, or their nodes would be asked for, and written, twice.
+        """
+        self.release()
+        self.production.restore_pending()
 
     def scout(self, view: View, stats: FrameStats) -> None:
         """Traces some rays before the picture: while answers are written at once, some rays that
