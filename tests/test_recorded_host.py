@@ -107,6 +107,24 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 
 
 @pytest.mark.parametrize("backend", COMPILED)
+def test_an_answer_that_its_producer_cancels_has_failed(blobs, backend):
+    class Fickle(gv.VolumeProducer):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any() or not (nodes.loc[:, :3] > 2).all(1).any():
+                return super().fill(nodes)
+            future: Future = Future()
+            threading.Timer(0.01, future.cancel).start()
+            return future
+
+    with gv.Engine(Fickle(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        _, stats = frames.whole(pause=0.01)
+        assert stats.failed == len(engine.failures) > 0 and frames.served.pending == 0
+        assert engine.failures[0].message == "CancelledError"
+        assert all(min(failure.loc[:3]) > 2 for failure in engine.failures)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("how", ["failures forgotten", "frame broken off"])
 def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
     """Nodes that are no longer marked as pending are asked for again."""

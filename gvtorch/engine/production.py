@@ -137,7 +137,7 @@ class _PendingBatch:
         return self.asked_at + self.batch.source.patience - time.monotonic()
 
 
-def _try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
+def try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
     """Calls a producer; returns its answer and None, or None and the error that it raised."""
     try:
         return call(), None
@@ -259,7 +259,7 @@ class Production:
             if item.answer_future.done():
                 seconds = time.monotonic() - item.asked_at
                 self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
-                answered += self._settle(item.batch, *_try_call(item.answer_future.result))
+                answered += self._settle(item.batch, *try_call(item.answer_future.result))
                 self._waiting.remove(item)
             elif item.seconds_left < 0:
                 self._waiting.remove(item)
@@ -359,14 +359,14 @@ class Production:
     def _submit(self, batch: RequestBatch) -> list[Answered]:
         """Asks for a batch; returns the answers that come at once."""
         start = time.perf_counter()
-        answer, raised = _try_call(batch.ask)
+        answer, raised = try_call(batch.ask)
         if isinstance(answer, Future):
             if not answer.done():
                 self._mark(batch)
                 future = self._send_on_arrival(batch, answer)
                 self._waiting.append(_PendingBatch(batch, answer, future, time.monotonic()))
                 return []
-            answer, raised = _try_call(answer.result)
+            answer, raised = try_call(answer.result)
         answered = self._settle(batch, answer, raised)
         self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
         return answered
