@@ -445,6 +445,10 @@ class Producer(torch.nn.Module):
     def close(self) -> None:
         """Closes files and stops threads; does nothing unless overridden."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the engine that it serves: a copy serves none."""
+        return {name: value for name, value in vars(self).items() if name != "layout"}
+
     def __repr__(self) -> str:
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
