@@ -476,7 +476,14 @@ def test_nothing_to_do(backend):
             "parent_t must be (4,) int32",
         ),
         (lambda w: ops.link(w, w.short(), w[0], w[0], 3), "kind must be REQUEST_LOAD"),
+        (lambda w: ops.link(w, w.short(), w[0], w[0], "x"), "kind must be an int"),
         (lambda w: ops.link(w, w.short(), w[0], w[0], LOAD, backend="gpu"), "backend must be auto"),
+        (
+            lambda w: ops.choose_requests(
+                w.view(1, 2, 16), w[:, :4].clone(), w[0, :2].long(), 8, 1, "fine"
+            ),
+            "coarse_first must be a bool, got str",
+        ),
     ],
 )
 def test_bad_arguments_are_named(call, message):

@@ -211,3 +211,51 @@ def test_what_matters_near_boxes_has_the_same_bits(name):
     whole, some = producer._evaluate(nodes, producer.field), producer.fill(nodes).data
     for channel, values in whole.items():
         assert torch.equal(values, some[channel]), channel
+
+
+class Flat(gv.Producer):
+    """One value everywhere; whether its range is told may change as well."""
+
+    value, tells = 0.0, True
+
+    def classify(self, nodes):
+        ends = torch.full((len(nodes), 2, 1), self.value)
+        kind = torch.full((len(nodes),), int(gv.Region.DATA))
+        return gv.Regions(kind=kind, ranges={"value": ends} if self.tells else {})
+
+    def fill(self, nodes):
+        return torch.full((len(nodes), *(nodes.layout.side,) * 3), self.value)
+
+
+@pytest.mark.backend("cpp")
+def test_a_root_whose_range_is_no_longer_told_is_not_skipped_by_the_old_one():
+    producer = Flat(16)
+    with gv.Engine(producer, brick_pool="16 MB") as engine:
+        assert engine.render(camera(16), GRAY).alpha.max() == 0
+        producer.value, producer.tells = 1.0, False
+        producer.changed()
+        assert engine.render(camera(16), GRAY).alpha.max() > 0.3
+
+
+@pytest.mark.backend("cpp")
+def test_a_change_during_a_renewal_is_not_lost():
+    """As another thread declares it, while the engine still makes what had changed before."""
+
+    class Busy(Flat):
+        later = None
+
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            if self.later is not None:
+                self.value, self.later = self.later, None
+                self.changed()
+            return bricks
+
+    producer = Busy(16)
+    with gv.Engine(producer, brick_pool="16 MB") as engine:
+        engine.render(camera(16), GRAY)
+        producer.value, producer.later = 0.2, 1.0
+        producer.changed()
+        engine.frame(camera(16), GRAY)
+        assert engine.changed, "and the next frame makes it"
+        assert engine.render(camera(16), GRAY).alpha.max() > 0.3 and not engine.changed

@@ -400,6 +400,7 @@ def test_clip_and_lens_go_together(blobs, compiled):
     [
         ({"planes": [(1, 0, 0, math.nan)]}, r"planes\[0\] must be finite"),
         ({"planes": [(1, 0, 0, 1), (0, 0, 0, 1)]}, r"planes\[1\] has a normal of length 0"),
+        ({"planes": [(1.7e308, 1.7e308, 0, 1)]}, r"planes\[0\] has a normal of length inf"),
         ({"planes": [(1, 0, 0)]}, r"planes\[0\] must be \(4,\)"),
         ({"planes": (1, 0, 0, 0)}, r"planes\[0\] must be"),
         ({"boxes": [((0, 0, 0), (1, -1, 1))]}, r"boxes\[0\] must have its low corner below"),

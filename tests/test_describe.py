@@ -37,6 +37,12 @@ def test_one_label_and_neighbours(dtype):
     assert facts["histogram"][0] == 59 and facts["histogram"][-1] == 1
 
 
+def test_labels_beyond_int16_are_told():
+    data = np.full((2, 3, 4), 40_000, np.uint16)
+    data[0] = 0
+    assert gv.Volume(data, labels=True).describe()["labels"] == "1, 40000 to 40000"
+
+
 def test_the_command_tells_it(tmp_path):
     data = np.zeros((3, 4, 5), np.float32)
     data[0, 0, 0], data[1, 1, 1] = -3e38, 3e38

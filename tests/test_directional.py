@@ -231,6 +231,13 @@ def test_integers_stand_for_0_to_1():
     assert volume.filter == "directional" and torch.equal(volume.data, torch.ones_like(volume.data))
 
 
+def test_units_and_axes_are_kept():
+    data = torch.rand(2, 3, 4, 4)
+    info = gv.ImageInfo(unit="micrometer", space="right-anterior-superior", quantity="light")
+    facts = gv.Volume(data, info=info).directional().info
+    assert (facts.unit, facts.space, facts.quantity) == (info.unit, info.space, None)
+
+
 def test_a_store_refuses_six_directions(tmp_path):
     with pytest.raises(ValueError, match="convert: a store's levels are means"):
         convert(rgba().directional(), tmp_path / "out.zarr")

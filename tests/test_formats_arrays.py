@@ -89,6 +89,14 @@ def test_names_places_and_units_of_xarray(grid):
         gv.as_volume(labelled(grid).to_dataset())
 
 
+@pytest.mark.parametrize("option", [{"axes": "zyx"}, {"time": 1}, {"spacing": (1, 1, 2)}])
+def test_a_volume_is_returned_as_it_is_or_refused(option):
+    volume = gv.Volume(np.zeros((3, 4, 5), np.float32), (2, 2, 2))
+    assert gv.as_volume(volume, time=0, nan=0.0) is volume
+    with pytest.raises(ValueError, match=f"as_volume: {next(iter(option))} is for arrays; a Vol"):
+        gv.as_volume(volume, **option)
+
+
 def test_dask_computes_what_is_asked_for(tmp_path):
     requested: list[tuple[int, ...]] = []
 

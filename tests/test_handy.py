@@ -148,6 +148,22 @@ def test_a_net_may_change_its_dtype_around_a_tracer(blobs, shader, change):
 
 
 @pytest.mark.backend("cpp")
+def test_what_is_made_in_inference_mode_works_outside_of_it(blobs):
+    """torch lets nobody write inference tensors there, and every frame writes its pools."""
+    view = camera(12, distance=1.3)
+    with torch.inference_mode():
+        tree, engine = gv.N3Tree.from_volume(blobs), gv.Engine(gv.VolumeProducer(blobs))
+        tracer = gv.TreeTracer(tree, GRAY)
+        expected = gv.render(tree, view, GRAY).color
+    with engine:
+        assert torch.equal(engine.render(view, GRAY).color, expected)
+    assert torch.equal(tracer(*tracer.rays(view))[0], expected)
+    assert torch.equal(gv.render(tree, view, GRAY).color, expected)
+    tree.refresh()
+    assert torch.equal(gv.render(tree, view, GRAY).color, expected)
+
+
+@pytest.mark.backend("cpp")
 @pytest.mark.parametrize("shader", [GRAY, gv.Lit(GRAY), gv.Projection("max", GRAY)])
 def test_a_tracer_takes_rays_of_any_leading_shape(blobs, shader):
     """With a camera's rays, in the shape of its picture, it returns the pictures of `render`."""

@@ -59,6 +59,8 @@ def test_errors_of_arrays_have_one_line():
     for call in (
         lambda: check.box("here", square),
         lambda: check.box("here", torch.zeros(3, 3)),
+        lambda: check.box("here", torch.tensor(3.0)),
+        lambda: check.box("here", np.array(3.0)),
         lambda: check.one_of("here", "x", square, ("a", "b")),
         lambda: check.one_of("here", "x", np.array(["a"]), ("a", "b")),
         lambda: check.one_of("here", "x", "z" * 5000, ("a", "b")),
@@ -71,7 +73,7 @@ def test_errors_of_arrays_have_one_line():
 
 def test_devices_are_those_of_tensors_or_refused():
     assert check.device("here", "cpu:0") == gv.Volume(GRID).to("cpu:3").data.device == GRID.device
-    for name in ("mps", "xla", "vulkan"):
+    for name in ("mps", "xla", "vulkan", "meta"):
         assert f"device '{name}' can't be used" in line_of(
             lambda name=name: check.device("x", name)
         )

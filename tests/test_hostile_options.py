@@ -117,6 +117,8 @@ def test_a_clip_takes_arrays(tree):
 
 
 def test_flags_lists_and_names_are_checked(tree, volume):
+    engine, loc_t4 = gv.Engine(gv.VolumeProducer(volume), **SIZE), tree.nodes.loc_t4
+    node = torch.zeros(1, dtype=torch.int64)
     for make, message in (
         (lambda: gv.Clip(caps="no"), "Clip: caps must be a bool, got str"),
         (lambda: gv.Clip(planes=torch.tensor(1.0)), "Clip: planes must be a list, got Tensor"),
@@ -124,6 +126,13 @@ def test_flags_lists_and_names_are_checked(tree, volume):
         (lambda: gv.Channel(coarse="no"), "Channel: coarse must be a bool, got str"),
         (lambda: gv.N3Tree.from_volume({1: volume}), "name of a channel must be a str, got int"),
         (lambda: gv.render(tree, VIEW, GRAY, backend=["cpp"]), "backend must be a str, got list"),
+        (lambda: gv.ops.locate(loc_t4, node, 2, 8, backend=["cpp"]), "backend must be auto, ref"),
+        (lambda: gv.render(tree, VIEW, GRAY, progress=None), "render: progress must be a function"),
+        (lambda: gv.cost(tree, VIEW, GRAY, progress=1), "cost: progress must be a function, got"),
+        (lambda: gv.cost(tree, VIEW, GRAY).picture("lod", colormap=[]), r"unknown colormap \[\]"),
+        (lambda: gv.N3Tree.from_volume(volume, progress=None), "from_volume: progress must be"),
+        (lambda: engine.frame(VIEW, GRAY, progress=None), "frame: progress must be a function"),
+        (lambda: engine.render(VIEW, GRAY, progress="x"), "render: progress must be a function"),
         (lambda: gv.BrickTable(np.zeros((1, 4, 4, 4, 1))), r"must be contiguous .*, got ndarray"),
         (lambda: gv.cost(tree, VIEW, GRAY).picture("lod", low=math.nan), "Cost: low must be"),
         (lambda: gv.cost(tree, VIEW, GRAY).picture("lod", high="a"), "Cost: high must be"),

@@ -44,6 +44,7 @@ def test_labels_of_every_dtype_are_kept_exactly(dtype, low, high):
     assert volume.info.labels and volume.data.dtype.itemsize == (data.itemsize if narrow else 1)
     if not narrow:
         assert torch.equal(volume.label_values, torch.from_numpy(np.unique(data.astype(np.int64))))
+    assert np.array_equal(kept(gv.read_volume(volume)), kept(volume))
     if np.dtype(dtype).isnative:
         again = gv.Volume(torch.from_numpy(data), info=gv.ImageInfo(labels=True))
         assert torch.equal(again.data, volume.data)

@@ -149,8 +149,10 @@ def test_what_is_wrong_is_named():
     skewed, flat, mirrored = (projection.clone() for _ in range(3))
     skewed[0, 1], flat[2, 3], mirrored[1, 1] = 0.1, 0, -1
     ortho = torch.diag(torch.tensor([1.0, 1, -1, 1]))
+    fisheye = gv.Camera.look_at((0, 0, 0), (0, 0, -1), fov=90, model="fisheye")
     for call, message in (
         (lambda: matrices(gv.Camera.orbit(), 0.1), "matrices: an orbit camera has no position yet"),
+        (lambda: matrices(fisheye, 0.1), "matrices: camera must be a pinhole camera, got Camera"),
         (lambda: matrices(camera, 0), "near must be finite and > 0"),
         (lambda: matrices(camera, 2, 1), "far must be finite and > 2"),
         (lambda: matrices(camera, 1, math.nan), "far must be finite"),

@@ -99,6 +99,9 @@ def test_points_of_a_pixel_add_up_and_have_a_mean_distance():
     middle = float(layer.depth[16, 16])
     assert middle == pytest.approx((0.6 * red + 1.0 * green) / (red + green), rel=1e-3)
     assert torch.isinf(layer.depth[0, 0]) and not layer.alpha[0, 0].any()
+    numbers = {"size": torch.tensor(1.5), "reference": torch.tensor(producer.spacing[0])}
+    again = gv.point_layer(producer, camera, **numbers)
+    assert torch.allclose(again.color, layer.color)
 
 
 @pytest.mark.parametrize(

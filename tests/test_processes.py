@@ -52,7 +52,10 @@ def test_producers_are_pickled(store, name):
         expected = engine.render(VIEW, shader)
         assert expected.alpha.max() > 0
         again = copy.deepcopy(other)  # before an engine has prepared it
-    for copied in (other, again):
+        used = copy.deepcopy(producer)  # a copy serves no engine
+        with gv.Engine(used) as second:
+            assert torch.equal(second.render(VIEW, shader).color, expected.color)
+    for copied in (other, again, pickle.loads(pickle.dumps(used))):
         with gv.Engine(copied) as engine:
             assert torch.equal(engine.render(VIEW, shader).color, expected.color)
 

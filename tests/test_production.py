@@ -164,13 +164,83 @@ def test_wrong_regions_are_named(answer, message):
         assert engine.failures[0].kind == "subdivide" and picture.alpha.max() > 0.1
 
 
-@pytest.mark.parametrize("how", ["raises", "nan", "never answers"])
-def test_a_root_that_cannot_be_made_is_an_error_at_once(how):
+#: Answers of the wrong form, given voxels (k, ...), and what the failures say.
+MALFORMED = {
+    "no data": (lambda v: gv.Bricks(data=None), "fill: data must be a dict, got NoneType"),
+    "data": (lambda v: gv.Bricks(data=v), "fill: data must be a dict, got ("),
+    "constants": (
+        lambda v: gv.Bricks(data={"value": v}, constants=torch.zeros(len(v), 1)),
+        "fill: constants must be a dict, got (",
+    ),
+    "no errors": (lambda v: gv.Bricks(data={"value": v}, errors=None), "errors must be a dict"),
+    "key": (
+        lambda v: gv.Bricks(data={"value": v}, errors={"0": "x"}),
+        "errors names an item that is not in the batch",
+    ),
+    "message": (
+        lambda v: gv.Bricks(data={"value": v}, errors=dict.fromkeys(range(len(v)), 404)),
+        "404",
+    ),
+    "kind": (
+        lambda v: gv.Bricks(data={"value": v}, kind=torch.full((len(v),), 2j)),
+        "kind must be (",
+    ),
+    "sparse": (lambda v: {"value": v.to_sparse()}, "float32 on cpu, sparse_coo"),
+    "meta": (lambda v: {"value": v.to("meta")}, "float32 on meta"),
+    "mapping": (lambda v: gv.Bricks(data=Unreadable()), "KeyError: 'unreadable'"),
+}
+
+
+class Unreadable(dict):
+    def __iter__(self):
+        raise KeyError("unreadable")
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("how", MALFORMED)
+def test_answers_of_the_wrong_form_fail_and_never_break_the_frame(how):
+    answer, message = MALFORMED[how]
+
+    class Wrong(Ball):
+        def fill(self, nodes):
+            values = super().fill(nodes)["value"]
+            return answer(values) if (nodes.depth > 0).any() else values
+
+    with gv.Engine(Wrong(), **SIZE) as engine:
+        stats = engine.render(CORNER, GRAY).stats
+        assert stats.converged and stats.failed == len(engine.failures) > 0
+        assert message in engine.failures[0].message
+        engine.validate()
+
+
+@pytest.mark.backend("cpp")
+def test_a_failure_is_one_printable_line():
+    class Loud(Ball):
+        def fill(self, nodes):
+            if (nodes.depth > 0).any():
+                raise RuntimeError("\x1b[31mfire\n" * 10_000)
+            return super().fill(nodes)
+
+    with gv.Engine(Loud(), **SIZE) as engine:
+        engine.render(CORNER, GRAY)
+        message = engine.failures[0].message
+        assert message.startswith("RuntimeError: \\x1b[31mfire") and len(message) < 2000
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("raises", "RuntimeError: the disk is on fire$"),
+        ("nan", "channel 'value' holds NaN or infinite values$"),
+        ("never answers", "TimeoutError: no answer within 0.1 s$"),
+    ],
+)
+def test_a_root_that_cannot_be_made_is_an_error_at_once(how, message):
     class Rootless(Broken):
         def bad(self, nodes):
             return nodes.depth == 0
 
-    with pytest.raises(ProductionError, match="the root of tree 'scene' can't be made: "):
+    with pytest.raises(ProductionError, match=f"the root of tree 'scene' can't be made: {message}"):
         gv.Engine(Rootless(how), patience=0.1, **SIZE)
 
 
@@ -209,6 +279,18 @@ def test_the_root_is_waited_for_as_long_as_the_producer_says(patience):
     with gv.Engine(producer, patience=0.05, **SIZE) as engine:
         assert engine.trees["scene"].patience == patience
     pool.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("own", "part", "expected"), [(None, 5.0, 7.0), (None, 9.0, 9.0), (1.0, 5.0, 1.0)]
+)
+def test_joined_producers_are_as_patient_as_the_most_patient_part(own, part, expected):
+    """A part without a patience of its own has the engine's."""
+    parts = {"a": Ball(), "b": Ball()}
+    joined = gv.JoinedProducer(parts)
+    joined.patience, parts["a"].patience = own, part
+    with gv.Engine(joined, patience=7, **SIZE) as engine:
+        assert engine.trees["scene"].patience == expected
 
 
 @pytest.mark.backend("cpp")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import threading
 import time
+import weakref
 from concurrent.futures import Future
 from typing import Any
 
@@ -15,6 +17,7 @@ from helpers.recorded import COMPILED, TRANSFER, Frames, view
 
 import gvtorch as gv
 from gvtorch.engine import host_frame, request_batch
+from gvtorch.engine.upload_queue import UploadQueue
 from gvtorch.io.stores.conversion import convert
 
 
@@ -101,6 +104,99 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
             if stats.converged:
                 break
         assert stats.converged and engine.render(view(24), TRANSFER).stats.produced["bricks"] == 0
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_an_answer_that_its_producer_cancels_has_failed(blobs, backend):
+    class Fickle(gv.VolumeProducer):
+        def fill(self, nodes):
+            if (nodes.depth == 0).any() or not (nodes.loc[:, :3] > 2).all(1).any():
+                return super().fill(nodes)
+            future: Future = Future()
+            threading.Timer(0.01, future.cancel).start()
+            return future
+
+    with gv.Engine(Fickle(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        _, stats = frames.whole(pause=0.01)
+        assert stats.failed == len(engine.failures) > 0 and frames.served.pending == 0
+        assert engine.failures[0].message == "CancelledError"
+        assert all(min(failure.loc[:3]) > 2 for failure in engine.failures)
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("how", ["failures forgotten", "frame broken off"])
+def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
+    """Nodes that are no longer marked as pending are asked for again."""
+    producer = Later(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]._executor
+        producer.late = []
+        while not producer.late:
+            frames.frame()
+            asker.submit(int).result()
+        asked = len(producer.late)
+        if how == "failures forgotten":
+            engine.forget_failures()
+        else:
+            with pytest.raises(KeyError), engine.new_frame(frames.view.options):
+                raise KeyError
+        while len(producer.late) == asked:
+            frames.frame()
+            asker.submit(int).result()
+        producer.late, late = None, producer.late
+        for future, bricks in late:
+            future.set_result(bricks)
+        frames.whole(pause=0.01)
+        engine.validate()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_graph_that_is_dropped_gives_its_buffers_and_its_nodes_back(blobs, backend):
+    producer = Later(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        frames.served.graph = weakref.ref(frames)
+        buffers = weakref.ref(frames.served._uploads[0])
+        producer.late = []
+        while not producer.late:
+            frames.frame()
+        producer.late, late = None, producer.late
+        del frames
+        assert engine.render(view(24), TRANSFER).stats.produced["bricks"] > 0
+        assert not engine.host_frames
+        for future, bricks in late:
+            future.set_result(bricks)
+        late.clear()
+        del future
+        gc.collect()
+        assert buffers() is None
+        engine.validate()
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_a_closed_engine_asks_for_nothing_more(blobs, backend):
+    class Slow(gv.VolumeProducer):
+        asked, gate, calls = threading.Event(), threading.Event(), 0
+
+        def fill(self, nodes):
+            if threading.current_thread().name.startswith("gvtorch-ask"):
+                self.calls += 1
+                self.asked.set()
+                self.gate.wait()
+                raise RuntimeError("its files are closed")
+            return super().fill(nodes)
+
+    producer = Slow(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        while not Slow.asked.is_set():
+            frames.frame()
+            time.sleep(0.01)
+        asker = engine.host_frames[0]._executor
+    Slow.gate.set()
+    asker.shutdown()  # waits for its thread
+    assert producer.calls == 1
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -262,3 +358,22 @@ def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
         engine.validate()
         locs = [failure.loc for failure in engine.failures]
         assert len(locs) == len(set(locs)) >= calls[0], "each is named once"
+
+
+def test_a_batch_larger_than_memory_is_refused_before_it_is_allocated(monkeypatch):
+    form = {"bricks": {"data": ((10, 10, 10, 1), torch.float32)}}
+    monkeypatch.setattr("os.sysconf", lambda _: 1000)
+    with pytest.raises(ValueError, match="a batch of 512 takes"):
+        UploadQueue(form, 512, torch.device("cpu"))
+
+
+def test_an_engine_that_is_closed_cancels_the_answers_on_their_way(blobs):
+    producer = Later(blobs)
+    with gv.Engine(producer, brick_size=4) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        producer.late = late = []
+        while not late:
+            frames.frame()
+            time.sleep(0.01)
+        engine.host_frames[0]._executor.submit(int).result()
+    assert all(future.cancelled() for future, _ in late)

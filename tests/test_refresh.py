@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import gvtorch as gv
 from gvtorch.base.volume import CHANNEL_DTYPES, movable
+from gvtorch.pool.refresh import BrickLevels
 
 SOFT = gv.TransferFunction.from_points(
     [(0, 0), (60, 0.1), (200, 0.9)], [(0, 1, 0, 0), (200, 0, 1, 1)]
@@ -280,6 +281,26 @@ def test_mistakes_are_named(blobs):
             call()
         assert message in str(caught.value) and "\n" not in str(caught.value)
     tree.refresh([(1e6, 1e6, 1e6), (2e6, 2e6, 2e6)])  # outside of the tree: nothing to do
+
+
+def test_a_box_far_from_the_corner_is_found_to_the_voxel(monkeypatch):
+    """In float32 the spacing would be off by a third of a voxel there."""
+    pools = gv.NodePool(1, {"value": gv.Channel()}), gv.BrickPool(1, {"value": gv.Channel()})
+    place = {"extent": (20_000_000, 1, 1), "spacing": (0.1,) * 3, "origin": (0.0,) * 3}
+    tree, spans = gv.N3Tree(*pools, depth=22, **place), []
+    monkeypatch.setattr(BrickLevels, "refresh", lambda _, span, *settings: spans.append(span))
+    tree.refresh(((1_899_999.97, 0, 0), (1_900_000.03, 0, 0)))
+    assert [(span.first, span.end) for span in spans] == [((0, 0, 19_000_000), (1, 1, 19_000_001))]
+
+
+def test_a_copy_on_another_device_is_edited_separately(blobs, monkeypatch):
+    tree = gv.N3Tree.from_volume(blobs)
+    monkeypatch.setattr("gvtorch.base.check.device", lambda *_: torch.device("meta"))
+    other = tree.to("meta")
+    before = dict(tree.value_range)
+    other.value_range["value"] = (0.0, 1e9)
+    assert tree.value_range == before
+    assert other.turns is not tree.turns
 
 
 def test_a_tree_moves_and_keeps_what_is_known_of_it(blobs, compiled):

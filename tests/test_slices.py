@@ -229,3 +229,10 @@ def test_the_command_shows_patients(tmp_path):
     assert run.returncode == 0 and "axial: right is on the left" in run.stdout
     run = gvtorch("slice", tmp_path / "a.nii", "-o", tmp_path / "b.png", "--plain")
     assert run.returncode == 0 and out.read_bytes() != (tmp_path / "b.png").read_bytes()
+
+
+def test_a_picture_larger_than_memory_is_refused_before_it_is_made(monkeypatch):
+    volume = gv.Volume(torch.rand(4, 64, 64))
+    monkeypatch.setattr("os.sysconf", lambda _: 1000)
+    with pytest.raises(ValueError, match="slice_picture: the picture takes"):
+        gv.slice_picture(volume, scale=10, span=(0, 1))

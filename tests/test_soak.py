@@ -175,6 +175,10 @@ def flight(
                 producer.fault = pick.choice(["", *FAULTS])
             if pick.random() < 0.3:
                 view = random_view(pick)
+            if pick.random() < 0.05:
+                engine.forget_failures()
+            if pick.random() < 0.03 and not isinstance(producer, Spotted):  # whose roots may fail
+                producer.changed()
             if replay is not None and pick.random() < 0.5:
                 replay(view)
             elif pick.random() < 0.1:

@@ -10,6 +10,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -19,6 +21,8 @@ from helpers.producers import Ball, Late
 from helpers.recorded import Frames
 
 import gvtorch as gv
+from gvtorch.cache import KINDS
+from gvtorch.engine.production import Failures
 
 POOLS = {"brick_size": 4, "brick_pool": 150 * 6**3 * 4, "node_pool": 60 * 8 * 20}
 VIEWS = [
@@ -108,6 +112,22 @@ def test_an_engine_closed_by_another_thread_says_so(blobs):
 
 
 @pytest.mark.backend("cpp")
+def test_failures_are_forgotten_while_a_captured_frame_reports_others():
+    loc = torch.arange(40_000).view(-1, 4)
+    targets = SimpleNamespace(loc=loc)
+    source = SimpleNamespace(name="a")
+    batch: Any = SimpleNamespace(source=source, kind=KINDS["load"], targets=targets)
+    failures = Failures(strict=False)
+    failures.add(batch, "slow", None)
+    with ThreadPoolExecutor(1) as thread:
+        targets.loc = loc + 40_000
+        adding = thread.submit(failures.add, batch, "slow", None)
+        while not adding.done():
+            failures.forget("another")
+        adding.result()
+    assert len(failures) == 20_000
+
+
 def test_a_frame_within_a_frame_is_refused():
     class Curious(Ball):
         engine: gv.Engine | None = None

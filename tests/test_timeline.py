@@ -54,6 +54,20 @@ def test_times_and_nesting_are_those_of_the_stages(tmp_path):
     assert count["args"] == {"loaded": 7} and not stages._timelines
 
 
+def test_a_timeline_that_is_opened_again_begins_anew(tmp_path):
+    path = tmp_path / "t.json"
+    trace = gv.Timeline(path)
+    for name in ("first", "second"):
+        with trace, stage(name):
+            with pytest.raises(RuntimeError, match="Timeline: it is open already"):
+                trace.__enter__()
+            trace.count("bricks", loaded=7)
+        (span,) = spans(path)
+        assert span["name"] == name and span["ts"] >= 0
+    with pytest.raises(ValueError, match="Timeline: path must be a str or PathLike, got int"):
+        gv.Timeline(3)
+
+
 def test_a_trace_is_written_after_a_mistake_too(tmp_path):
     with pytest.raises(ZeroDivisionError), gv.Timeline(tmp_path / "t.json"), stage("broken"):
         raise ZeroDivisionError

@@ -130,6 +130,17 @@ def test_tiles_know_their_place_and_parent():
     assert tree.nodes.loc_t4[0].tolist() == [0, 0, 0, 0] and int(tree.nodes.parent_t[0]) == -1
 
 
+@pytest.mark.parametrize("branching", [2, 3])
+def test_a_node_is_found_by_its_loc_and_by_no_other(branching):
+    tree = gv.N3Tree.from_volume(gv.Volume(torch.rand(16, 16, 16)), 4, branching=branching)
+    node = torch.tensor([0, *range(branching**3, tree.nodes.child_tn.numel())])
+    assert torch.equal(tree.find(tree.loc(node)), node)
+    wrong = [(branching, 0, 0, 1), (-1, 0, 0, 1), (0, 0, 0, -1), (0, 0, 0, 99), (1 << 40, 0, 0, 2)]
+    assert tree.find(torch.tensor(wrong)).tolist() == [-1] * len(wrong)
+    with pytest.raises(ValueError, match="N3Tree: loc must be"):
+        tree.find(torch.tensor([0, 0, 0, 0]))
+
+
 def test_uniform_regions_take_no_brick():
     data = torch.full((32, 32, 32), 5, dtype=torch.uint8)
     data[20:28, 20:28, 20:28] = 9

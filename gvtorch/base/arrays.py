@@ -129,9 +129,9 @@ def as_volume(
     """Returns an array of any library as a volume in memory.
 
     Args:
-        given: A volume (returned as it is), a tensor, or an array: NumPy, xarray (keeps names,
-            coordinates and units of its axes), dask, zarr, h5py, or any object with `__array__`,
-            `__array_interface__` or `__dlpack__`.
+        given: A volume (returned as it is, with its own axes, time, spacing and origin), a tensor,
+            or an array: NumPy, xarray (keeps names, coordinates and units of its axes), dask, zarr,
+            h5py, or any object with `__array__`, `__array_interface__` or `__dlpack__`.
         axes: A letter among t c z y x for each axis, for axes without meaningful names. If left
             out, three axes are (z, y, x).
         time: Which time point, from 0; the first, with a warning, if left out where there are more.
@@ -145,6 +145,10 @@ def as_volume(
             needed, or does not fit.
     """
     if isinstance(given, Volume):
+        own = {"axes": axes, "time": time or None, "spacing": spacing, "origin": origin}
+        for name, value in own.items():
+            if value is not None:
+                raise ValueError(f"{context}: {name} is for arrays; a Volume has its own")
         return given
     first_time = 0 if time is None else time
     if isinstance(given, Tensor):

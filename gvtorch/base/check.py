@@ -28,10 +28,13 @@ Kind = TypeVar("Kind")
 
 
 def describe(tensor: Any) -> str:
-    """Returns shape, dtype and device of a tensor as one phrase, or the type of anything else."""
+    """Returns shape, dtype and device of a tensor as one phrase, with its layout unless dense; or
+    the type of anything else.
+    """
     if not isinstance(tensor, Tensor):
         return type(tensor).__name__
-    return f"{as_text(tensor)} on {tensor.device}"
+    layout = "" if tensor.layout == torch.strided else f", {tensor.layout}"
+    return f"{as_text(tensor)} on {tensor.device}{layout}".replace("torch.", "")
 
 
 def summary(record: Any) -> str:
@@ -225,10 +228,12 @@ def device(context: str, value: Any) -> torch.device:
         return torch.device("cpu")  # as in `tensor.device`, whatever the index
     if parsed.type != "cuda":
         try:
-            return torch.empty(0, device=parsed).device
+            number = torch.zeros((), device=parsed)
+            number.item()  # fails on the device "meta"
+            return number.device
         except (RuntimeError, AssertionError):
             raise ValueError(
-                f"{context}: device {str(parsed)!r} can't be used here: torch lacks it"
+                f"{context}: device {str(parsed)!r} can't be used here: torch can't read there"
             ) from None
     if not torch.cuda.is_available():
         raise ValueError(f"{context}: device 'cuda' can't be used here: torch sees no CUDA device")
@@ -358,9 +363,11 @@ def triple(
 
 def box(context: str, value: Any) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Returns two corners, (x, y, z) each; ValueError unless all sides are positive."""
-    if not hasattr(value, "__len__") or len(value) != 2:
-        raise ValueError(f"{context}: box must be two corners, got {quoted(value)}")
-    low, high = (triple(context, "box", corner) for corner in value)
+    try:
+        low, high = value
+    except (TypeError, ValueError):
+        raise ValueError(f"{context}: box must be two corners, got {quoted(value)}") from None
+    low, high = (triple(context, "box", corner) for corner in (low, high))
     sides = [b - a for a, b in zip(low, high, strict=True)]
     triple(context, "sides of the box", sides, positive=True)
     return low, high

@@ -31,6 +31,12 @@ def one_line(error: object, limit: int = _MAX_CHARACTERS) -> str:
     return f"{line[:half_length]} ... {line[-half_length:]}"
 
 
+def with_type(error: BaseException) -> str:
+    """Returns an error in one line, its type in front: "division by zero" alone tells little."""
+    name = type(error).__name__
+    return f"{name}: {one_line(error)}" if str(error).strip() else name
+
+
 def printable(text: object) -> str:
     """Returns a text with control characters escaped, as in "\\x1b": names and contents of files
     are untrusted.

@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -33,6 +33,13 @@ Mark = float | torch.cuda.Event
 
 def no_progress(what: str, done: int, total: int) -> None:
     """Shows nothing."""
+
+
+def check_progress(context: str, progress: Any) -> None:
+    """Raises ValueError unless a user's `progress` can be called."""
+    if not callable(progress):
+        got = type(progress).__name__
+        raise ValueError(f"{context}: progress must be a function, got {got}")
 
 
 def mark(device: torch.device) -> Mark:
@@ -157,6 +164,7 @@ class Timeline:
             ValueError: The path ends differently, or there is no such device.
             FileNotFoundError: The folder does not exist.
         """
+        check.instance("Timeline", "path", path, str, os.PathLike)
         self._path, self._device = Path(path), check.device("Timeline", device)
         if self._path.suffix != ".json":
             raise ValueError(f"Timeline: path must end in .json, got {str(path)!r}")
@@ -171,7 +179,10 @@ class Timeline:
         return f"Timeline({str(self._path)!r}, {len(self._spans)} stages)"
 
     def __enter__(self) -> Timeline:
-        """Starts recording."""
+        """Starts recording, anew if it was opened before; RuntimeError while it is open."""
+        if self in _timelines:
+            raise RuntimeError("Timeline: it is open already")
+        self._spans, self._counts, self._tracks = [], [], {}
         self._start_ns = time.perf_counter_ns()
         if self._device.type == "cuda":
             torch.cuda.synchronize(self._device)

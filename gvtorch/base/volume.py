@@ -171,7 +171,8 @@ class Volume:
             raise ValueError(f"{context}: opacity must lie in 0 to 1, got {low:g} to {high:g}")
         color = color if premultiplied else color * opacity
         views = torch.cat((color, opacity), -1).to(dtype).repeat(1, 1, 1, len(DIRECTIONS))
-        volume = Volume(views, self.spacing, self.origin, name=self.name)
+        info = replace(self.info, channels=(), quantity=None, labels=False)
+        volume = Volume(views, self.spacing, self.origin, name=self.name, info=info)
         volume.filter = "directional"
         return volume
 
@@ -206,7 +207,8 @@ class Volume:
         if not self.info.labels:
             return {}
         table = self.label_values
-        label_numbers = movable(self.data).unique().to(torch.int64) if table is None else table
+        stored = self.data.to(torch.int32)  # torch can't compare uint16
+        label_numbers = stored.unique().to(torch.int64) if table is None else table
         note = "" if table is None else "; the other numbers are places in their list"
         return {"labels": f"{counted(label_numbers)}{note}"}
 

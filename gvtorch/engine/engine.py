@@ -7,6 +7,7 @@ Detailed Voxel Rendering", I3D 2009; Crassin, PhD thesis 2011.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial, wraps
 from typing import Any, Literal, TypeVar, Unpack, cast
@@ -15,8 +16,9 @@ from torch import Tensor
 
 from ..base import check
 from ..base.explicit import explicit
+from ..base.lasting import lasting
 from ..base.records import Hits, Rays
-from ..base.stage import Progress, no_progress
+from ..base.stage import Progress, check_progress, no_progress
 from ..cameras import Camera
 from ..cameras.custom import as_camera
 from ..io.http import retry_refused
@@ -115,6 +117,7 @@ class Engine(FrameSteps):
             ValueError: An argument is of the wrong type or out of its range.
             ProductionError: A node can't be produced, and the engine is strict.
         """
+        check_progress("frame", progress)
         view = self.view("frame", camera, shader, options)
         with self.new_frame(view.options) as stats:
             self.serve_last_frame(stats)  # choose requests, produce, take slots, write, link
@@ -169,13 +172,14 @@ class Engine(FrameSteps):
         Returns:
             The picture. Its `stats` are those of the last frame, except that times, produced,
             evicted and uploaded bytes are sums over all frames, and used tiles and bricks the
-            maximum of one frame. `capacity_exceeded`: rays had to be traced in subsets, or some
-            requests found no slot.
+            maximum of one frame. `capacity_exceeded` of a converging picture: rays had to be traced
+            in subsets.
 
         Raises:
             ValueError: The mode is unknown, or see `frame`.
             ProductionError: See `frame`.
         """
+        check_progress("render", progress)
         check.integer("render", "productions", productions, low=1)
         check.integer("render", "max_frames", max_frames, low=1)
         check.one_of("render", "mode", mode, ("interactive", "balanced", "converge"))
@@ -240,6 +244,7 @@ class Engine(FrameSteps):
 
     @explicit(RenderOptions)
     @_locked
+    @lasting
     def capture(
         self,
         camera: Camera | Rays,
@@ -303,9 +308,11 @@ class Engine(FrameSteps):
                 f"Engine.capture: {'fit' if fit else 'look_ahead'} needs replays that serve: all "
                 "producers on_device, or all on_host, without coarse channels"
             )
+        graph = FrameGraph(self, view, recorded, render_frame, look_ahead)
         if isinstance(recorded, HostFrame):
+            recorded.graph = weakref.ref(graph)
             self.host_frames.append(recorded)
-        return FrameGraph(self, view, recorded, render_frame, look_ahead)
+        return graph
 
     @cached_property
     def box(self) -> Tensor:
@@ -322,7 +329,7 @@ class Engine(FrameSteps):
         """Lets failed nodes be requested again, and files that servers refused be read again."""
         retry_refused()
         self.production.failures.forget()
-        self.production.restore_pending()
+        self.restore_pending()
 
     def memory(self) -> dict[str, int]:
         """Returns bytes by name: content of each pool, and bookkeeping."""

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -29,7 +29,7 @@ from ..cache.write import (
 )
 from ..pool.staging import TableRows
 from ..producers import Bricks, Region, Regions
-from .production import Production
+from .production import Production, try_call
 from .recorded import RecordedFrame, SlotCounts
 from .request_batch import (
     ProducedTree,
@@ -54,7 +54,12 @@ class HostFrame(RecordedFrame):
     several frames at once, so that it catches up. If an answer takes longer than `_CALL_GAP`, it
     calls without waiting: one slow read delays nothing else. The thread in which an answer arrives
     checks and queues it; the next frame sends all queued answers, and writes them.
+
+    Attributes:
+        graph: Weak reference to the graph that replays it; None: there is no graph.
     """
+
+    graph: Callable[[], object] | None = None
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
         super().__init__(production, batch, fit)
@@ -113,8 +118,19 @@ class HostFrame(RecordedFrame):
             self._asked_count = self._failed_count = 0
         self._production.restore_pending()
 
+    @property
+    def abandoned(self) -> bool:
+        """Whether nobody can replay it any more."""
+        return self.graph is not None and self.graph() is None
+
     def close(self) -> None:
-        """Ends the thread that asks producers."""
+        """Cancels the answers on their way, and ends the thread that asks for more."""
+        with self._lock:
+            self.generation += 1
+            futures = list(self._waiting)
+            self._waiting.clear()
+        for future in futures:
+            future.cancel()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def serve(self) -> None:
@@ -232,27 +248,25 @@ class HostFrame(RecordedFrame):
                     self._submit(RequestBatch(source, kind, targets, generation=generation))
 
     def _submit(self, batch: RequestBatch) -> None:
-        """Asks for a batch; if the producer raises, asks again for each half."""
+        """Asks for a batch. One of an earlier generation is dropped."""
+        if batch.generation != self.generation:
+            return
+        answer, raised = try_call(batch.ask)
+        if not isinstance(answer, Future):
+            self._settle(batch, answer, raised)
+            return
 
         def on_arrival(future: Future) -> None:
             with self._lock:
                 was_waiting = self._waiting.pop(future, None) is not None  # else it was given up
             self._schedule_ask()
             if was_waiting and batch.generation == self.generation:
-                self._settle(batch, future.result)
+                self._settle(batch, *try_call(future.result))
 
-        try:
-            answer = batch.ask()
-        except Exception as error:
-            self._ask_halves(batch, error)
-            return
-        if isinstance(answer, Future):
-            with self._lock:  # not while a callback is added: it may be called at once
-                if batch.generation == self.generation:
-                    self._waiting[answer] = time.monotonic() + batch.source.patience, batch
-            answer.add_done_callback(on_arrival)
-        else:
-            self._settle(batch, lambda: answer)
+        with self._lock:  # not while a callback is added: it may be called at once
+            if batch.generation == self.generation:
+                self._waiting[answer] = time.monotonic() + batch.source.patience, batch
+        answer.add_done_callback(on_arrival)
 
     def _fail_overdue(self) -> None:
         """Records batches as failed whose answers have not come in time."""
@@ -264,18 +278,13 @@ class HostFrame(RecordedFrame):
         for future, batch in overdue.items():
             give_up(batch, future, self._fail)
 
-    def _ask_halves(self, batch: RequestBatch, error: Exception) -> None:
-        for half in halves_to_retry(batch, error, self._fail):
-            self._submit(half)
-
-    def _settle(self, batch: RequestBatch, get_answer: Callable[[], Any]) -> None:
-        """Checks an answer and queues it, in the thread in which it arrives."""
-        try:
-            answer = get_answer()
-        except CancelledError:
-            return  # the producer is closed
-        except Exception as error:
-            self._ask_halves(batch, error)
+    def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> None:
+        """Checks an answer and queues it, in the thread in which it arrives; if the producer
+        raised, asks it again for each half of the batch.
+        """
+        if raised is not None:
+            for half in halves_to_retry(batch, raised, self._fail):
+                self._submit(half)
             return
         valid = valid_part(batch, answer, self._fail)
         if valid is None:

@@ -5,6 +5,7 @@ and not asked for again; its ancestors stand in for it, and other nodes are not 
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from ..base.messages import one_line
 from ..base.stage import stage
 from ..cache import KINDS, Cache, RequestList, Scheduler, write
 from ..cache.requests import Requests, coarser_requests, extra_levels, levels_wanted, requests_below
@@ -63,7 +65,9 @@ class Failure:
 
 
 class Failures:
-    """All nodes that failed, by loc, because a node's tile may be given away and come back."""
+    """All nodes that failed, by loc, because a node's tile may be given away and come back. Any
+    thread in which an answer arrives may add some.
+    """
 
     def __init__(self, strict: bool) -> None:
         self.strict = strict
@@ -71,6 +75,7 @@ class Failures:
         self._failed: set[tuple[str, int, tuple[int, ...]]] = set()  # tree, kind, loc
         self._first_failure: tuple[Failure, BaseException | None] | None = None
         self._last_count = 0
+        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self._failed)
@@ -82,12 +87,13 @@ class Failures:
 
     def add(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Records the nodes of a batch as failed."""
-        tree, text = batch.source.name, " ".join(message.split())
+        tree, text = batch.source.name, one_line(message or "no reason given")
         kind = next(name for name, kind in KINDS.items() if kind == batch.kind)
-        for loc in map(tuple, batch.targets.loc.tolist()):
-            self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
-            self._failed.add((tree, batch.kind, loc))
-        self._first_failure = self._first_failure or (self.newest[-1], cause)
+        with self._lock:
+            for loc in map(tuple, batch.targets.loc.tolist()):
+                self.newest.append(Failure(tree=tree, kind=kind, loc=loc, message=text))
+                self._failed.add((tree, batch.kind, loc))
+            self._first_failure = self._first_failure or (self.newest[-1], cause)
 
     def among(self, batch: RequestBatch) -> Tensor | None:
         """Returns (k,) bool, which nodes of a batch failed before; None if none did."""
@@ -101,17 +107,19 @@ class Failures:
         """Raises `ProductionError` for the first failure since the last call, if strict: at the end
         of a frame, when the pools are consistent.
         """
-        first_failure, self._first_failure = self._first_failure, None
+        with self._lock:
+            first_failure, self._first_failure = self._first_failure, None
         if self.strict and first_failure is not None:
             failure, cause = first_failure
             raise ProductionError(str(failure)) from cause
 
     def forget(self, tree: str | None = None) -> None:
         """Forgets the failures of a tree, or all."""
-        kept_failures = [failure for failure in self.newest if tree not in (None, failure.tree)]
-        self.newest.clear()
-        self.newest.extend(kept_failures)
-        self._failed = {node for node in self._failed if tree not in (None, node[0])}
+        with self._lock:
+            kept_failures = [failure for failure in self.newest if tree not in (None, failure.tree)]
+            self.newest.clear()
+            self.newest.extend(kept_failures)
+            self._failed = {node for node in self._failed if tree not in (None, node[0])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +137,7 @@ class _PendingBatch:
         return self.asked_at + self.batch.source.patience - time.monotonic()
 
 
-def _try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
+def try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
     """Calls a producer; returns its answer and None, or None and the error that it raised."""
     try:
         return call(), None
@@ -251,7 +259,7 @@ class Production:
             if item.answer_future.done():
                 seconds = time.monotonic() - item.asked_at
                 self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
-                answered += self._settle(item.batch, *_try_call(item.answer_future.result))
+                answered += self._settle(item.batch, *try_call(item.answer_future.result))
                 self._waiting.remove(item)
             elif item.seconds_left < 0:
                 self._waiting.remove(item)
@@ -351,14 +359,14 @@ class Production:
     def _submit(self, batch: RequestBatch) -> list[Answered]:
         """Asks for a batch; returns the answers that come at once."""
         start = time.perf_counter()
-        answer, raised = _try_call(batch.ask)
+        answer, raised = try_call(batch.ask)
         if isinstance(answer, Future):
             if not answer.done():
                 self._mark(batch)
                 future = self._send_on_arrival(batch, answer)
                 self._waiting.append(_PendingBatch(batch, answer, future, time.monotonic()))
                 return []
-            answer, raised = _try_call(answer.result)
+            answer, raised = try_call(answer.result)
         answered = self._settle(batch, answer, raised)
         self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
         return answered

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
+from ..base.messages import with_type
 from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
@@ -45,14 +46,24 @@ class ProducedTree:
     @property
     def patience(self) -> float:
         """Seconds after which an answer that has not come is given up."""
-        producer_patience = self.producer.patience
-        return self.engine_patience if producer_patience is None else producer_patience
+        return self.producer.patience_in(self.engine_patience)
 
     def wait(self, answer: Any) -> Any:
         """Returns the producer's answer; waits for a future, at most for `patience`."""
-        if not hasattr(answer, "result"):
+        if not isinstance(answer, Future):
             return answer
-        return answer.result(None if self.patience == math.inf else self.patience)
+        try:
+            return answer.result(None if self.patience == math.inf else self.patience)
+        except TimeoutError:
+            if answer.done():  # the error is the answer
+                raise
+            answer.cancel()
+            raise TimeoutError(self.no_answer) from None
+
+    @property
+    def no_answer(self) -> str:
+        """The message about an answer that has not come in time."""
+        return f"no answer within {self.patience:g} s"
 
     @cached_property
     def host_layout(self) -> Layout:
@@ -158,7 +169,7 @@ def halves_to_retry(
     fails alone. A single node fails, and so does the batch after too many calls that raised.
     """
     if next(batch.raised) > _MAX_RAISING_CALLS or len(batch) == 1:
-        fail(batch, f"{type(error).__name__}: {error}", error)
+        fail(batch, with_type(error), error)
         return ()
     middle = len(batch) // 2
     return batch[:middle], batch[middle:]
@@ -167,7 +178,7 @@ def halves_to_retry(
 def give_up(batch: RequestBatch, future: Future, fail: Fail) -> None:
     """Cancels a batch whose answer has not come in time, and fails it."""
     future.cancel()
-    fail(batch, f"no answer within {batch.source.patience:g} s", None)
+    fail(batch, batch.source.no_answer, None)
 
 
 def valid_part(
@@ -178,8 +189,8 @@ def valid_part(
     """
     try:
         checked = batch.check(answer)
-    except ValueError as error:
-        fail(batch, str(error), error)
+    except Exception as error:
+        fail(batch, str(error) if isinstance(error, ValueError) else with_type(error), error)
         return None
     if checked.errors:
         reasons: dict[int, str] = {}  # by index in the batch
@@ -235,14 +246,12 @@ def children_of(batch: RequestBatch, answer: Regions, cache: Cache) -> Children:
 
 def _default_range(cache: Cache, name: str, kind: Tensor, constant: Tensor | None) -> Tensor:
     """Returns (k, 2, c) ranges not given: constants (k, c) of CONSTANT nodes, else the dtype's."""
-    channel = cache.bricks.channels[name]
-    shape, dtype, device = (len(kind), channel.width), channel.dtype, kind.device
-    limits = [torch.full(shape, limit, dtype=dtype, device=device) for limit in channel.limits]
-    ranges = torch.stack([movable(limit) for limit in limits], 1)
-    if constant is not None:
-        uniform = (kind == Region.CONSTANT)[:, None, None]
-        ranges = torch.where(uniform, movable(constant)[:, None].expand(-1, 2, -1), ranges)
-    return ranges.view(channel.dtype)
+    ranges = cache.bricks.channels[name].unknown_range(len(kind), device=kind.device)
+    if constant is None:
+        return ranges
+    uniform = (kind == Region.CONSTANT)[:, None, None]
+    rows = torch.where(uniform, movable(constant)[:, None].expand(-1, 2, -1), movable(ranges))
+    return rows.view(ranges.dtype)
 
 
 def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBatch, Bricks]]:
@@ -283,7 +292,7 @@ def check_and_send(batch: RequestBatch, answer: Any, staging: Staging) -> Any:
         return answer
     try:
         checked = batch.check(answer)
-    except ValueError:
+    except Exception:
         return answer  # the frame reports it
     sent = answer if checked.errors else send_voxels(batch, checked, staging)
     return sent if isinstance(sent, SentBricks) else answer

@@ -10,7 +10,7 @@ import torch
 
 from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
-from ..base.messages import one_line
+from ..base.messages import one_line, with_type
 from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import write_slots
@@ -40,7 +40,7 @@ class EngineOptions:
         border: Voxels around a brick; with 1 or more no seam shows.
         loading: straight: directly to the wanted level; levels: level by level.
         order: coarse or fine: which levels are served first.
-        load_budget: Most bricks made in a frame.
+        load_budget: Most bricks made in a frame; never more than 256 MB of them.
         subdivide_budget: Most node tiles made in a frame.
         time_budget: Most milliseconds of production in a frame; None: no limit.
         scout_rounds: Most passes of scouts, each at most a sixteenth of the rays, before a picture
@@ -269,9 +269,7 @@ def fill_root(cache: Cache, source: ProducedTree) -> None:
     try:
         _fill_root(cache, source)
     except Exception as error:
-        message = one_line(error)
-        if not isinstance(error, ValueError):
-            message = f"{type(error).__name__}: {message}"  # "division by zero" alone tells little
+        message = one_line(error) if isinstance(error, ValueError) else with_type(error)
         raise ProductionError(
             f"Engine: the root of tree {source.name!r} can't be made: {message}"
         ) from error
@@ -284,8 +282,9 @@ def _fill_root(cache: Cache, source: ProducedTree) -> None:
     root = Nodes(loc, source.layout, coarse=bool(cache.finest[tile] > 0))
     regions = checked_regions(source.wait(producer.classify(root)), root, producer)
     raise_first(regions.errors)
-    for channel, tensor in regions.ranges.items():
-        movable(nodes.ranges[channel])[tile, 0] = movable(tensor)[0]
+    for channel, stored in nodes.ranges.items():
+        unknown = cache.bricks.channels[channel].unknown_range(1, device=stored.device)
+        movable(stored)[tile, 0] = movable(regions.ranges.get(channel, unknown))[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
         bricks = checked_bricks(source.wait(producer.fill(root)), root, producer)

@@ -83,7 +83,7 @@ class FrameStats(RenderStats):
     stale: int = 0  # answers whose node was gone, served already, or known to fail
     pending: int = 0  # nodes whose answers are on their way
     deferred: int = 0  # requests that the budgets put off
-    failed: int = 0  # nodes that could not be produced, since the engine was made
+    failed: int = 0  # nodes that could not be produced, and whose failure is not forgotten
     capacity_exceeded: bool = False  # a request found no slot: all were in use
 
     def __post_init__(self) -> None:

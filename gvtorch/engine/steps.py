@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.lasting import lasting
 from ..base.records import Hits, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
@@ -37,6 +38,7 @@ _MAX_PRODUCED_BYTES = 256 * 10**6  # most bytes of voxels produced in one frame
 class FrameSteps:
     """The state of an engine, and the steps of its frames; see `Engine`, which documents both."""
 
+    @lasting
     def __init__(self, scene: Scene, options: EngineOptions) -> None:
         """Allocates the pools and makes the root of every tree."""
         self.options, self.lock = options, threading.RLock()
@@ -100,7 +102,7 @@ class FrameSteps:
             with collect_timings(self.device) if monitor else nullcontext() as timings:
                 yield stats
         except BaseException:
-            self.production.restore_pending()
+            self.restore_pending()
             raise
         end = mark(self.device)
 
@@ -144,15 +146,28 @@ class FrameSteps:
         for source in changed:
             self.production.forget(source)
             old_version, producer = self._versions[source.name], source.producer
+            version = producer.version  # another thread may change it further meanwhile
             renew_tree(self.cache, source, producer.changes(old_version))
-            self._versions[source.name] = producer.version
+            self._versions[source.name] = version
         self._missed = None
 
     def release(self, keep: RecordedFrame | None = None) -> None:
-        """Drops the answers that are on their way to captured frames, except those of `keep`."""
-        for host_frame in self.host_frames:
+        """Drops the answers that are on their way to captured frames, except those of `keep`, and
+        the frames whose graphs are gone, with their buffers.
+        """
+        for host_frame in list(self.host_frames):
             if host_frame is not keep:
                 host_frame.release()
+            if host_frame.abandoned:
+                host_frame.close()
+                self.host_frames.remove(host_frame)
+
+    def restore_pending(self) -> None:
+        """Marks the nodes whose answers are on their way as pending, and no others: answers to
+        captured frames are dropped, or their nodes would be asked for, and written, twice.
+        """
+        self.release()
+        self.production.restore_pending()
 
     def scout(self, view: View, stats: FrameStats) -> None:
         """Traces some rays before the picture: while answers are written at once, some rays that

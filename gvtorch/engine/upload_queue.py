@@ -13,6 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..base import check
+
 RowForm = Mapping[str, tuple[tuple[int, ...], torch.dtype]]  # shape and dtype of a row's fields
 
 _BUFFERS = 3  # one is filled while the others may still be copied
@@ -28,7 +30,7 @@ class UploadQueue:
     """
 
     def __init__(self, tables: Mapping[str, RowForm], rows: int, device: torch.device) -> None:
-        """Allocates the buffers."""
+        """Allocates the buffers; raises ValueError if they are larger than the memory."""
         self.rows, self.sent = rows, 0
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, Mapping[str, Tensor], int]] = deque()
@@ -42,6 +44,8 @@ class UploadQueue:
                 size = -(-size // _ALIGN) * _ALIGN
                 fields[table, name] = (size, (rows, *shape), dtype)
                 size += math.prod((rows, *shape)) * dtype.itemsize
+        for place, count in ((device, 1), (torch.device("cpu"), _BUFFERS)):
+            check.memory("Engine.capture", f"a batch of {rows}", count * size, place)
         self._cuda = device.type == "cuda"
         self._device_buffer = torch.zeros(size, dtype=torch.uint8, device=device)
         self._host_buffers = [

@@ -19,7 +19,7 @@ from ..base import check
 from ..base.arrays import ArrayLike, as_volume
 from ..base.boxes import check_extent
 from ..base.constants import MAX_VOXELS
-from ..base.volume import Volume
+from ..base.volume import Volume, to_numpy
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
 from .oblique import Oblique, straighten
@@ -240,7 +240,9 @@ def as_source(context: str, data: Any, axes: str | None = None) -> VolumeSource:
     """Returns a volume or an array as a source; see `ArrayLike.of` for arguments and errors."""
     if isinstance(data, Volume):
         placement: dict[str, Any] = {"spacing": data.spacing, "origin": data.origin}
-        return MemorySource.of(data.data.cpu().numpy(), path=data.name, info=data.info, **placement)
+        values, labels = to_numpy(data.data), data.label_values
+        values = values if labels is None else labels.numpy()[values.astype(np.int64)]
+        return MemorySource.of(values, path=data.name, info=data.info, **placement)
     if not hasattr(data, "shape") or not hasattr(data, "dtype") or hasattr(data, "device"):
         if not isinstance(data, np.ndarray):
             return as_source(context, as_volume(data, axes=axes, context=context))

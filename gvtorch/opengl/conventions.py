@@ -44,7 +44,7 @@ def matrices(
     """Makes the matrices with which OpenGL draws the pixels of a camera.
 
     Args:
-        camera: In world units (an orbit camera: `camera.placed(tree.box)`).
+        camera: Pinhole cameras in world units (an orbit camera: `camera.placed(tree.box)`).
         near: Distance of the near plane along the view axis, world units.
         far: Distance of the far plane along the view axis, world units; may be infinite.
         clip_depth: What `glClipControl` is set to.
@@ -56,10 +56,13 @@ def matrices(
         projection and modelview, both (4, 4) float64, or (n, 4, 4) for a batch.
 
     Raises:
-        ValueError: The camera is an orbit camera without a position, or not 0 < near < far.
+        ValueError: The camera is of another model, or an orbit camera without a position, or not
+            0 < near < far.
     """
     context = "opengl.matrices"
-    if check.instance(context, "camera", camera, Camera).frame is not Coordinates.WORLD:
+    if check.instance(context, "camera", camera, Camera).model != "pinhole":
+        raise ValueError(f"{context}: camera must be a pinhole camera, got {camera!r}")
+    if camera.frame is not Coordinates.WORLD:
         raise ValueError(f"{context}: an orbit camera has no position yet, call placed(tree.box)")
     near = check.number(context, "near", near, low=0, open_low=True)
     if far != math.inf:

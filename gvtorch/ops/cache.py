@@ -366,8 +366,8 @@ def cut_bricks(
     check.no_gradient(context, "values_zyxc", values_zyxc)
     check.tensor(context, "values_zyxc", values_zyxc, shape, values_zyxc.dtype, place_k3.device)
     check.tensor(context, "place_k3", place_k3, ("k", 3), torch.int64, place_k3.device)
-    check.integer(context, "brick_size", brick_size, low=1, high=2**10)
-    check.integer(context, "border", border, low=0, high=2**10)
+    brick_size = check.integer(context, "brick_size", brick_size, low=1, high=2**10)
+    border = check.integer(context, "border", border, low=0, high=2**10)
     if not values_zyxc.numel():
         raise ValueError(f"{context}: values_zyxc has no voxels, got {check.describe(values_zyxc)}")
     if choose_backend(backend, place_k3.device) != "reference":

@@ -23,6 +23,7 @@ Flags = Annotated[Tensor, torch.bool]
 Bytes = Annotated[Tensor, torch.uint8]
 Doubles = Annotated[Tensor, torch.float64]
 Count = Annotated[int, range(2**31)]  # what an int32 can count
+_INT64 = range(-(2**63), 2**63)
 _DTYPES = (torch.int32, torch.int64, torch.int16, torch.bool, torch.uint8, torch.float64)
 _Twin = TypeVar("_Twin", bound=Callable[..., Any])
 _Fake = TypeVar("_Fake", bound=Callable[..., Any])
@@ -44,13 +45,18 @@ def device_of(backend: str) -> torch.device:
     return torch.device("cuda" if on_cuda else "cpu")
 
 
-@functools.cache
 def choose_backend(backend: str, device: torch.device) -> str:
     """Returns the backend to run on `device`; `auto` is the compiled one where it is available.
 
     Raises:
         ValueError: The backend is unknown, can't be used here, or does not run on `device`.
     """
+    choose = _cached_backend if isinstance(backend, str) else uncached_backend
+    return choose(backend, device)
+
+
+def uncached_backend(backend: str, device: torch.device) -> str:
+    """Does what `choose_backend` does, for torch.compile, which warns of caches."""
     if backend not in ("auto", "reference", "cpp", "cuda"):
         raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
     compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
@@ -64,7 +70,7 @@ def choose_backend(backend: str, device: torch.device) -> str:
     return backend
 
 
-uncached_backend = choose_backend.__wrapped__  # torch.compile warns of caches
+_cached_backend = functools.cache(uncached_backend)
 
 
 def runs_twin(backend: str, *tensors: Tensor) -> bool:
@@ -99,11 +105,13 @@ def op(
         annotations = {
             name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated
         }
+        annotations |= {name: _INT64 for name, hint in hints if hint is int}
         ranges = {
             name: annotation
             for name, annotation in annotations.items()
             if isinstance(annotation, range)
         }
+        flags = [name for name, hint in hints if hint is bool]
         positions = {name: position for position, name in enumerate(names)}
         tensors = [
             (positions[name], name, check.shape_of(name) if "_" in name else "", dtype)
@@ -113,11 +121,12 @@ def op(
         ]
 
         @functools.wraps(twin)
-        def run(*args: Any, backend: Backend = "auto", **kwargs: Any) -> Any:
+        def run(*given: Any, backend: Backend = "auto", **kwargs: Any) -> Any:
+            args = list(given)
             if kwargs or len(args) != len(names):
                 bound = signature.bind(*args, **kwargs)
                 bound.apply_defaults()
-                args = tuple(bound.arguments.values())[: len(names)]
+                args = list(bound.arguments.values())[: len(names)]
             device = check.instance(op_name, names[0], args[0], Tensor).device
             fields = [
                 (name, args[position], shape or _any_shape(op_name, name, args[position]), dtype)
@@ -128,9 +137,12 @@ def op(
                 if dtype == torch.float64:
                     check.no_gradient(op_name, name, args[position])
             for name, allowed in ranges.items():
-                check.integer(
-                    op_name, name, args[positions[name]], low=allowed[0], high=allowed[-1]
+                position = positions[name]
+                args[position] = check.integer(
+                    op_name, name, args[position], low=allowed[0], high=allowed[-1]
                 )
+            for name in flags:
+                check.instance(op_name, name, args[positions[name]], bool)
             if extra_check is not None:
                 extra_check(**dict(zip(names, args, strict=True)))
             if choose_backend(backend, device) == "reference":

@@ -88,7 +88,7 @@ def voxelize(
         ),
         {"n": boxes_of(len(corner_f33))},
     )
-    check.integer(context, "side", side, low=1, high=MAX_CUBE_SIDE)
+    side = check.integer(context, "side", side, low=1, high=MAX_CUBE_SIDE)
     thickness = check.number(context, "thickness", thickness, low=0)
     detail = check.number(context, "detail", detail, low=0)
     use_twin = choose_backend(backend, device) == "reference"

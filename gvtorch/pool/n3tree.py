@@ -16,7 +16,8 @@ from ..base import check
 from ..base.constants import CONSTANT, MAX_BRANCHING, TERMINAL
 from ..base.image_info import ImageInfo
 from ..base.labels import background
-from ..base.stage import Progress, no_progress
+from ..base.lasting import lasting
+from ..base.stage import Progress, check_progress, no_progress
 from ..base.turns import Turns
 from ..base.volume import Volume, movable
 from ..ops import locate
@@ -166,17 +167,21 @@ class N3Tree:
 
     def nearest(self, loc: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (k,) int64 nodes with locs (k, 4) x, y, z, depth, or their nearest ancestors that
-        exist, and (k,) bool, whether it is the node itself.
+        exist, and (k,) bool, whether it is the node itself. A loc that no node of the tree can have
+        gives the root and False.
         """
-        n, node = self.branching, torch.full_like(loc[:, 0], self.root)
-        exact = torch.ones_like(node, dtype=torch.bool)
+        check.tensor("N3Tree", "loc", loc, ("k", 4), torch.int64, self.device)
+        n, node, depth = self.branching, torch.full_like(loc[:, 0], self.root), loc[:, 3]
+        side = n ** depth.clamp(0, self.depth)
+        exact = ((loc[:, :3] >= 0) & (loc[:, :3] < side[:, None])).all(1)
+        exact &= (depth >= 0) & (depth <= self.depth)
         child = self.nodes.child_tn.view(-1)
-        for level in range(1, int(loc[:, 3].max()) + 1 if len(loc) else 0):
+        for level in range(1, int((depth * exact).max()) + 1 if len(loc) else 0):
             tile = child[node].to(torch.int64)
-            up = (loc[:, 3] - level).clamp(min=0)
+            up = (depth - level).clamp(0, self.depth)
             x, y, z = (loc[:, axis] // n**up % n for axis in range(3))
             child_node = tile * self.nodes.nodes_per_tile + (z * n + y) * n + x
-            deeper = level <= loc[:, 3]
+            deeper = level <= depth
             exact = exact & (~deeper | (tile >= 0))
             node = torch.where(deeper & exact, child_node, node)
         return node, exact
@@ -223,6 +228,7 @@ class N3Tree:
         self._check_words()
 
     @classmethod
+    @lasting
     def from_volume(
         cls,
         volume: Volume | Mapping[str, Volume],
@@ -258,6 +264,7 @@ class N3Tree:
 
         Source: Crassin et al., "GigaVoxels", I3D 2009, section 3; docs/design.md, section 2.
         """
+        check_progress("from_volume", progress)
         originals = volumes_by_channel("from_volume", volume)
         device = check.device("from_volume", device)
         build_device = choose_build_device(originals.values(), device)
@@ -294,10 +301,14 @@ class N3Tree:
         tree.bricks.in_order()
         return tree
 
+    @lasting
     def to(self, device: torch.device | str) -> N3Tree:
         """Returns the tree with its pools on a device; tensors already there are shared."""
         device, other = check.device("N3Tree.to", device), copy.copy(self)
         other.nodes, other.bricks = self.nodes.to(device), self.bricks.to(device)
+        if device != self.device:  # its content may be edited separately
+            other.value_range, other.made_of = dict(self.value_range), dict(self.made_of)
+            other.turns = Turns()
         return other
 
     def to_volume(self, channel: str | None = None) -> Volume:
@@ -347,7 +358,7 @@ class N3Tree:
             corners = check.reals("N3Tree.refresh", "box", box, (2, 3))
             if not bool((corners[0] <= corners[1]).all()):
                 raise ValueError(f"N3Tree.refresh: box must be low and high corner, got {box!r}")
-            corner_voxels = ((corners - self.box[0]) / torch.tensor(self.spacing)).tolist()
+            corner_voxels = ((corners - self.box[0]) / corners.new_tensor(self.spacing)).tolist()
             sizes = zip(*corner_voxels, self.extent, strict=True)
             spans = [(max(0, math.floor(a)), min(n, math.floor(b) + 1)) for a, b, n in sizes]
             low, high = (tuple(end) for end in zip(*spans, strict=True))

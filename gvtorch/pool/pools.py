@@ -55,6 +55,12 @@ class Channel:
         dtype_info = torch.finfo if self.dtype.is_floating_point else torch.iinfo
         return (dtype_info(self.dtype).min, dtype_info(self.dtype).max)
 
+    def unknown_range(self, *shape: int, device: torch.device | str) -> Tensor:
+        """Returns (*shape, 2, width) ranges of nodes of which nothing is known: `limits`."""
+        size = (*shape, self.width)
+        ends = [torch.full(size, n, dtype=self.dtype, device=device) for n in self.limits]
+        return torch.stack([movable(end) for end in ends], -2).view(self.dtype)
+
 
 def phrase(channels: Mapping[str, Channel]) -> str:
     """Returns channels as one phrase for a repr, as in "density float32x1, color uint8x4"."""
@@ -231,9 +237,7 @@ class NodePool(_Pool):
                 continue
             shape = (capacity, n, channel.width)
             self.constants[name] = torch.zeros(shape, dtype=channel.dtype, device=device)
-            limits = torch.tensor(channel.limits, dtype=torch.float64).to(channel.dtype)
-            ends = movable(limits.to(device))[:, None].expand(capacity, n, 2, channel.width)
-            self.ranges[name] = ends.contiguous().view(channel.dtype)
+            self.ranges[name] = channel.unknown_range(capacity, n, device=device)
 
     @property
     def nodes_per_tile(self) -> int:

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.lasting import lasting
 
 _MAX_RING_BYTES = 256 * 10**6  # most bytes of a ring
 #: Bytes of a chunk: smaller is all overhead, larger overlaps less.
@@ -272,6 +273,7 @@ class Staging:
             self._spans.append(span)
             return span
 
+    @lasting
     def _allocate(self) -> None:
         if self._host_ring is not None:
             return

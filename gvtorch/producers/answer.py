@@ -93,12 +93,19 @@ def _checked(
             f"{context}: must return {answer_type.__name__} or {alternative}, got {got}"
         )
     kind: Any
-    layout, count, kind, errors = nodes.layout, len(nodes), answer.kind, dict(answer.errors)
-    if any(not 0 <= index < count for index in errors):
+    layout, count, kind = nodes.layout, len(nodes), answer.kind
+    for name in ("data", "constants", "ranges", "errors"):
+        if not isinstance(by_name := getattr(answer, name, {}), Mapping):
+            got = check.describe(by_name)
+            raise ValueError(f"{context}: {name} must be a dict, got {got}")
+    if not all(hasattr(index, "__index__") and 0 <= index < count for index in answer.errors):
         raise ValueError(f"{context}: errors names an item that is not in the batch of {count}")
+    errors = {int(index): str(message) for index, message in answer.errors.items()}
     if kind is not None or isinstance(answer, Regions):
-        is_integer = isinstance(kind, Tensor) and not kind.is_floating_point()
-        if not is_integer or kind.shape != (count,) or kind.dtype == torch.bool:
+        is_integer = isinstance(kind, Tensor) and not (
+            kind.is_floating_point() or kind.is_complex() or kind.dtype == torch.bool
+        )
+        if not is_integer or kind.shape != (count,):
             got = check.describe(kind)
             raise ValueError(f"{context}: kind must be ({count},) of Region, got {got}")
         kind = kind.to(torch.int64)
@@ -186,6 +193,8 @@ def _by_channel(
             and tensor.shape == expected_shape
             and tensor.dtype == spec.dtype
         )
+        if isinstance(tensor, Tensor):
+            fits = fits and tensor.layout == torch.strided and not tensor.is_meta
         if not fits:
             sizes = ", ".join(str(size) for size in expected_shape)
             dtype = str(spec.dtype).removeprefix("torch.")

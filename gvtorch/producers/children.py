@@ -66,7 +66,7 @@ class FromChildren(OfProducers):
         super().__init__(
             **grid_of(producer), channels=producer.channels, value_range=producer.value_range
         )
-        self.producer, self.patience = producer, producer.patience
+        self.producer = producer
         self.levels = check.integer(context, "levels", levels, low=1, high=10)
         self._cache: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
         self._cached_version = producer.version  # the version that these blocks were made from
@@ -107,8 +107,9 @@ class FromChildren(OfProducers):
 
     def _drop_stale(self, layout: Layout) -> None:
         """Drops the blocks that have changed since they were made."""
+        version = self.producer.version  # another thread may change it further meanwhile
         changes, locs = self.producer.changes(self._cached_version), [*self._cache]
-        self._cached_version = self.producer.version
+        self._cached_version = version
         if changes is None or not locs:
             self._cache.clear()
             return

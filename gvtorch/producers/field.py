@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.check import extent_in, extent_of
 from ..base.constants import DEEP_VOXELS
-from ..base.messages import one_line
+from ..base.messages import with_type
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
@@ -335,7 +335,7 @@ def _call_field(context: str, field: nn.Module, method: Callable[..., Any], *arg
     except (MemoryError, torch.OutOfMemoryError):
         raise  # not the field's fault
     except Exception as error:
-        reason = f"{type(error).__name__}: {one_line(error)}"
+        reason = with_type(error)
         raise ValueError(f"{context}: field {type(field).__name__} failed: {reason}") from error
 
 

@@ -78,8 +78,6 @@ class JoinedProducer(OfProducers):
         self.producers = modules_by_name(context, producers)
         self.on_host = all(producer.on_host for producer in producers.values())
         self.on_device = all(producer.on_device for producer in producers.values())
-        waits = (part.patience for part in producers.values() if part.patience is not None)
-        self.patience = max(waits, default=None)
 
     def parts(self) -> dict[str, Producer]:
         return cast("dict[str, Producer]", dict(self.producers.items()))

@@ -8,6 +8,7 @@ Source: Crassin et al., "GigaVoxels", I3D 2009, section 5; Crassin, PhD thesis 2
 from __future__ import annotations
 
 import itertools
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -34,6 +35,7 @@ from .nodes import Layout, Nodes
 ChangeTest = Callable[[Nodes], Tensor]
 # Versions, shared by all producers: a later change has a larger one.
 _version_numbers = itertools.count(1)
+_version_lock = threading.Lock()  # any thread may declare a change
 _MAX_CHANGES = 64  # changes that are kept; if more are asked for, everything may have changed
 
 
@@ -182,7 +184,7 @@ class Producer(torch.nn.Module):
 
     Attributes:
         patience: Seconds after which an answer that has not come counts as failed; None: the
-            engine's.
+            engine's, or the longest of the producers that it is made of.
         layout: Set by the engine that uses this producer; otherwise None.
         on_device: Whether `classify` and `fill` take and return only tensors on the engine's
             device, and never make the host wait or copy from host memory, so that `Engine.capture`
@@ -298,6 +300,10 @@ class Producer(torch.nn.Module):
         """
         raise NotImplementedError(f"{type(self).__name__}: fill is not implemented")
 
+    def patience_in(self, engine_patience: float) -> float:
+        """Returns `patience`; or, where that is None, the engine's."""
+        return engine_patience if self.patience is None else self.patience
+
     def changed(self, where: ChangeTest | Tensor | Sequence[Any] | None = None) -> None:
         """Declares that the content has changed, for example to another time: in its next frame the
         engine drops what it holds of the changed nodes, and asks for them again.
@@ -321,12 +327,14 @@ class Producer(torch.nn.Module):
                     f"{context}: where must be low and high corners, got {boxes.tolist()}"
                 )
             where = partial(Nodes.touch, boxes=boxes.view(-1, 2, 3))
-        self.version = next(_version_numbers)
-        self._changes.append((self.version, where))
+        with _version_lock:
+            version = next(_version_numbers)
+            self._changes.append((version, where))
+            self.version = version
 
     def changes(self, since: int) -> list[ChangeTest] | None:
         """Returns functions that find the nodes changed since a version; None: any may have."""
-        newer = [finder for version, finder in self._changes if version > since]
+        newer = [finder for version, finder in list(self._changes) if version > since]
         finders = [finder for finder in newer if finder is not None]
         return finders if 0 < len(finders) == len(newer) < _MAX_CHANGES else None
 
@@ -437,6 +445,10 @@ class Producer(torch.nn.Module):
     def close(self) -> None:
         """Closes files and stops threads; does nothing unless overridden."""
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leaves out the engine that it serves: a copy serves none."""
+        return {name: value for name, value in vars(self).items() if name != "layout"}
+
     def __repr__(self) -> str:
         extent = "x".join(str(n) for n in self.extent)
         channels = phrase(self.channels)
@@ -459,6 +471,12 @@ class OfProducers(Producer):
     def host_bytes(self) -> int:  # type: ignore[override]
         """The sum over all parts."""
         return sum(part.host_bytes for part in self.parts().values())
+
+    def patience_in(self, engine_patience: float) -> float:
+        """Returns `patience`; or, where that is None, the longest of the parts."""
+        if self.patience is not None:
+            return self.patience
+        return max(part.patience_in(engine_patience) for part in self.parts().values())
 
     def changed(self, where: Any = None) -> None:
         """See `Producer.changed`; calls it for all parts."""

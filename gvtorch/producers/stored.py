@@ -214,7 +214,8 @@ class StoredProducer(Producer):
 
     def __getstate__(self) -> dict[str, Any]:
         unshared = ("_cache", "_closed", "_threads", "_process")
-        return {name: value for name, value in vars(self).items() if name not in unshared}
+        state = super().__getstate__()
+        return {name: value for name, value in state.items() if name not in unshared}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Opens the store again, with a new cache and new threads."""

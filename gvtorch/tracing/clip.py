@@ -272,8 +272,8 @@ def _is_list(value: Any) -> bool:
 def _face(name: str, numbers: Any) -> Face:
     a, b, c, d = check.reals("Clip", name, numbers, (4,)).tolist()
     length = math.hypot(a, b, c)
-    if length == 0:
-        raise ValueError(f"Clip: {name} has a normal of length 0: {numbers!r}")
+    if not 0 < length < math.inf:
+        raise ValueError(f"Clip: {name} has a normal of length {length:g}: {numbers!r}")
     return (a / length, b / length, c / length, d / length)
 
 

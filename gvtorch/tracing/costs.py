@@ -14,7 +14,7 @@ from torch import Tensor
 from ..base import check
 from ..base.explicit import explicit
 from ..base.records import Hits, Rays, RenderStats
-from ..base.stage import Progress, no_progress
+from ..base.stage import Progress, check_progress, no_progress
 from ..base.volume import movable
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
@@ -73,7 +73,7 @@ class Cost:
 
         check.one_of("Cost", "image", name, IMAGES)
         low = check.number("Cost", "low", low)
-        if colormap not in ColorMapType.__members__:
+        if not isinstance(colormap, str) or colormap not in ColorMapType.__members__:
             names = ", ".join(sorted(ColorMapType.__members__))
             raise ValueError(f"Cost: unknown colormap {colormap!r}; known: {names}")
         image = getattr(self, name).to("cpu", torch.float32)
@@ -124,6 +124,7 @@ def cost(
     Raises:
         ValueError: See `render`.
     """
+    check_progress("cost", progress)
     camera = as_camera("cost", camera)
     chosen = render_options("cost", options, camera)
     check.instance("cost", "tree", tree, N3Tree)

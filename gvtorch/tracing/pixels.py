@@ -19,7 +19,7 @@ from ..base import check
 from ..base.arrays import as_volume
 from ..base.explicit import explicit
 from ..base.records import Hits, Rays, RenderStats
-from ..base.stage import Progress, collect_timings, no_progress, stage
+from ..base.stage import Progress, check_progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
 from ..ops.registry import choose_backend
@@ -76,6 +76,7 @@ def render(
         ValueError: An option is unknown or out of its range, or the backend can't be used.
         RuntimeError: Another thread refreshes the tree.
     """
+    check_progress("render", progress)
     camera = as_camera("render", camera)
     chosen = render_options("render", options, camera)
     scene = _resident("render", tree)

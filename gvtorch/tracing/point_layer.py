@@ -55,10 +55,10 @@ def point_layer(
     check.instance(context, "camera", camera, Camera)
     if camera.model != "pinhole" or camera.batched:
         raise ValueError(f"{context}: the camera must be one pinhole camera, got {camera!r}")
-    check.number(context, "size", size, low=0.5, high=64)
-    check.number(context, "cone_scale", cone_scale, low=0, open_low=True)
+    size = check.number(context, "size", size, low=0.5, high=64)
+    cone_scale = check.number(context, "cone_scale", cone_scale, low=0, open_low=True)
     if reference is not None:
-        check.number(context, "reference", reference, low=0, open_low=True)
+        reference = check.number(context, "reference", reference, low=0, open_low=True)
     points, grid = producer.points, producer.points.grid
     placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64))
     view, K = placed.viewmats[0].numpy(), placed.Ks[0].numpy()

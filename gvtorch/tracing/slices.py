@@ -292,6 +292,8 @@ class _PlaneReader:
                 "slice_picture: colors must return red, green, blue (..., 3) of values (...), "
                 f"got {colored.shape} of {values.shape}"
             )
+        nbytes = len(rows) * len(columns) * colored.shape[2] * colored.itemsize
+        check.memory("slice_picture", "the picture", nbytes, torch.device("cpu"))
         image = colored[np.ix_(rows, columns)][..., :3]
         if view.letters:
             draw_letters(image, view.letters)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base import constants as config
+from ..base.lasting import lasting
 from ..base.records import Rays
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
@@ -39,6 +40,7 @@ class TreeTracer(torch.nn.Module):
 
         def __getattr__(self, name: str) -> Any: ...
 
+    @lasting
     def __init__(
         self,
         tree: N3Tree,
