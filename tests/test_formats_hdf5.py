@@ -116,6 +116,22 @@ def test_packed_values_and_missing_ones(tmp_path, grid):
     assert np.array_equal(volume.data[..., 0].numpy(), expected.astype("f4"))
 
 
+def test_coordinates_may_be_packed(tmp_path, grid):
+    """As those of GOES images are: small integers, with a factor and an offset."""
+    steps = {"x": 0.25, "y": 2.0, "z": -0.5}
+    sizes = dict(zip("zyx", grid.shape, strict=True))
+    coords = {name: (name, step * np.arange(sizes[name]) + 3) for name, step in steps.items()}
+    data = xarray.Dataset({"v": (("z", "y", "x"), grid)}, coords)
+    packing = {"dtype": "i2", "add_offset": 3.0, "_FillValue": -1}
+    encoding = {name: {**packing, "scale_factor": step} for name, step in steps.items()}
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf", encoding=encoding)
+    data.to_zarr(tmp_path / "a", encoding=encoding, consolidated=False)
+    for volume in (gv.read_volume(tmp_path / "a.nc"), gv.read_volume(tmp_path / "a", key="v")):
+        assert volume.spacing == (0.25, 2, 0.5)
+        assert volume.origin == (3, 3, 3 - 0.5 * (sizes["z"] - 1))
+        assert np.array_equal(volume.data[..., 0].numpy(), grid[::-1])
+
+
 @pytest.mark.parametrize(
     ("attributes", "gaps"),
     [

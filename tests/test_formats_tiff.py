@@ -158,9 +158,17 @@ def test_turned_pages_and_centimeters_are_told(tmp_path):
     file = tmp_path / "a.tif"
     options = {"resolution": (2000, 2000), "resolutionunit": "CENTIMETER"}
     tifffile.imwrite(file, noise((3, 8, 9)), extratags=[(274, "H", 1, 6, False)], **options)
-    message = "size of a pixel in centimeters: .*; that its pages are to be shown turned"
+    message = (
+        "that its pages are to be shown turned or mirrored; the size of a pixel in centimeters"
+    )
     with pytest.warns(UserWarning, match=message):
         gv.read_volume(file)
+    (tmp_path / "s").mkdir()
+    tifffile.imwrite(
+        tmp_path / "s" / "0.tif", noise((1, 8, 9))[0], extratags=[(274, "H", 1, 6, False)]
+    )
+    with pytest.warns(UserWarning, match="not kept: that its pages are to be shown turned"):
+        gv.read_volume(tmp_path / "s")
 
 
 def test_a_file_that_ends_before_its_tiles(tmp_path):
@@ -205,6 +213,16 @@ def test_folders_of_pillow(tmp_path, ending, shape):
         assert [c.name for c in source.info.channels] == ["red", "green", "blue"]
     store = convert(folder, tmp_path / "a.zarr")
     assert np.array_equal(store.read_region(0, (0, 0, 0), (12, 40, 50)), actual)
+
+
+@pytest.mark.parametrize("ending", ["jpg", "tif"])
+def test_inks_are_no_light(tmp_path, ending):
+    data = noise((3, 9, 12, 4), "uint8")
+    for z, image in enumerate(data):
+        Image.fromarray(image, "CMYK").save(tmp_path / f"{z}.{ending}")
+    with pytest.warns(UserWarning, match="not kept: that its channels are inks"):
+        volume = gv.read_volume(tmp_path)
+    assert volume.data.shape[3] == 4 and volume.info.channels == ()
 
 
 def test_wide_png_of_simpleitk(tmp_path):

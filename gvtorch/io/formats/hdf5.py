@@ -20,7 +20,7 @@ from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, letter_of, named_axes
 from ...base.units import spacing_of
 from ..budget import check_beside
-from ..cf_source import CfSource, cf_fields, text_of
+from ..cf_source import CfSource, cf_fields, text_of, unpack_coordinates
 from ..source import Index
 from .format import Format, not_chosen
 
@@ -221,7 +221,8 @@ def _axes(
         _check_sources(path, scale)
         is_fitting = scale.shape == shape[axis : axis + 1] and scale.dtype.kind in "iuf"
         if is_fitting and shape[axis] <= _MAX_COORDINATES:
-            steps[axis] = even_steps(names[axis], scale[()], dropped)
+            coordinates = unpack_coordinates(scale[()], attributes)
+            steps[axis] = even_steps(names[axis], coordinates, dropped)
     tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]

@@ -18,7 +18,7 @@ from ..tiff_info import (
     imagej_info,
     ome_info,
     opened_tiff,
-    photometric_dropped,
+    shown_as,
     tiff_messages,
 )
 from .format import Format, choose
@@ -153,10 +153,8 @@ def _read_metadata(
     width = shape[axes.index("c")] if "c" in axes else 1
     if series.kind == "ome":
         return ome_info(file.ome_metadata, number, series.name, width)
-    photometric = int(series.keyframe.photometric)
-    is_color = width in (3, 4) and photometric in (2, 6)  # RGB, YCbCr
+    is_color, dropped = shown_as(series, width)
     channels = color_channels(width) if is_color else ()
-    dropped = [*photometric_dropped(series)]
     if series.kind == "imagej":
         info, spacing, also_dropped = imagej_info(file.imagej_metadata, _resolution(file), width)
         info = replace(info, channels=channels) if is_color else info
@@ -166,8 +164,6 @@ def _read_metadata(
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
         dropped.append("the size of a pixel in centimeters: the distance between pages is missing")
-    if tags.valueof("Orientation", 1) != 1:
-        dropped.append("that its pages are to be shown turned or mirrored")
     return ImageInfo(channels=channels), (1.0, 1.0, 1.0), dropped
 
 
