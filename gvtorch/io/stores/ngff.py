@@ -93,7 +93,7 @@ def find_image(
     if layout is not None:
         pyramid.store_json = group["gvtorch"]
         pyramid.info = _stored_info(pyramid.store_json.get("info"), pyramid.info)
-    pyramid.dropped += _label_notes(location, root, deadline)
+    pyramid.dropped += _label_notes(location, root, group, deadline)
     return root, pyramid, layout
 
 
@@ -247,13 +247,19 @@ def _image_folders(
     return [folder for folder in folders if isinstance(folder, str)] or ["0"]
 
 
-def _label_notes(location: str, root: Any, deadline: Deadline) -> list[str]:
-    """Returns a phrase on the label images in the image's group `labels`, if it has any."""
+def _label_notes(
+    location: str, root: Any, attributes: dict[str, Any], deadline: Deadline
+) -> list[str]:
+    """Returns a phrase on the label images in the image's group `labels`, if it has any. That group
+    has the same version of Zarr as the image, so a server is asked for one file.
+    """
+    name = "zarr.json" if "ome" in attributes else ".zattrs"
     try:
-        group = _attributes(f"{location}/labels", child(root, "labels"), deadline) or {}
+        group = read_json(f"{location}/labels", child(root, "labels"), name, deadline) or {}
     except (OSError, ValueError):
         return []
-    labels = _ngff_attribute(group, "labels")
+    group = group.get("attributes", group)
+    labels = _ngff_attribute(group, "labels") if isinstance(group, dict) else None
     if not isinstance(labels, list) or not labels:
         return []
     return [f"the labels {_join_some([f'labels/{name}' for name in labels])}"]
