@@ -74,6 +74,31 @@ def test_times_without_slices_and_a_store(tmp_path):
     assert store.info.unit == "nanometer" and store.width == 2
 
 
+def test_ome_tiff_of_several_files(tmp_path):
+    """A file per channel, each of which lists all."""
+    data = noise((2, 3, 20, 30), "uint16")
+    file = '<UUID FileName="{c}.tif">{c}</UUID>'
+    plane = f'<TiffData FirstC="{{c}}" FirstZ="{{z}}" IFD="{{z}}">{file}</TiffData>'
+    planes = "".join(plane.format(c=c, z=z) for c in range(2) for z in range(3))
+    sizes = " ".join(
+        f'Size{axis}="{n}"' for axis, n in zip("XYZCT", (30, 20, 3, 2, 1), strict=True)
+    )
+    for c in range(2):
+        xml = f'<OME UUID="{c}"><Image><Pixels {sizes} DimensionOrder="XYZCT" Type="uint16">'
+        xml += f"{planes}</Pixels></Image></OME>"
+        options = {"metadata": None, "photometric": "minisblack", "compression": "zlib"}
+        tifffile.imwrite(tmp_path / f"{c}.tif", data[c], description=xml, **options)
+    whole = np.moveaxis(data, 0, -1)
+    source = open_source(tmp_path / "1.tif")
+    assert np.array_equal(source.read_region((1, 2, 3), (3, 19, 20)), whole[1:, 2:19, 3:20])
+    store = convert(tmp_path / "0.tif", tmp_path / "a.zarr")
+    assert np.array_equal(store.read_region(0, (0, 0, 0), (3, 20, 30)), whole)
+    assert [Path(file).name for file in source.files] == [
+        "0.tif",
+        "1.tif",
+    ]  # `resume` compares them
+
+
 def test_several_series_and_pyramids(tmp_path):
     file = tmp_path / "a.ome.tif"
     fine, other = noise((3, 64, 64), "uint8"), noise((2, 5, 6), "uint8")
