@@ -221,6 +221,7 @@ def test_integers_of_gltf_may_be_fractions(tmp_path, kind, binary):
     floats = gv.read_mesh(file)
     for name in ("corners", "uv", "color"):
         assert np.array_equal(getattr(mesh, name), getattr(floats, name)), name
+    assert np.array_equal(mesh.color[..., :3], np.clip(mesh.corners, 0, 1))
     assert np.array_equal(np.unique(mesh.corners), [0, 1]) and len(mesh.faces) == 2
 
 
@@ -250,6 +251,40 @@ def test_texture_coordinates_of_gltf_are_chosen_and_moved(tmp_path, texture, mov
     u, v = moved(*mesh.corners[..., :2].transpose(2, 0, 1))
     assert np.allclose(mesh.uv, np.stack((u, 1 - v), -1), atol=1e-6)
     assert mesh.corners.tolist() == POINTS[[[0, 1, 2], [0, 2, 3]]].tolist(), "a fan"
+
+
+@pytest.mark.parametrize(
+    ("mode", "alpha", "plain_alpha"),
+    [
+        ({}, [255, 255, 255], 1),
+        ({"alphaMode": "MASK"}, [0, 0, 0], 0),
+        ({"alphaMode": "MASK", "alphaCutoff": 0.25}, [0, 255, 255], 1),
+        ({"alphaMode": "BLEND"}, [50, 200, 255], 0.4),
+    ],
+    ids=str,
+)
+def test_a_gltf_material_says_how_it_uses_alpha(tmp_path, mode, alpha, plain_alpha):
+    """By default it is opaque, whatever alpha is."""
+    from PIL import Image
+
+    file = tmp_path / "a.gltf"
+    pixels = np.array([[[9, 9, 9, a] for a in (50, 200, 255)]], np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "d\u00e9 ts.png")
+    attributes = {name: (POINTS[:3, :n], False) for name, n in (("POSITION", 3), ("TEXCOORD_0", 2))}
+    attributes["COLOR_0"] = (np.full((3, 4), 0.5, "f4"), False)
+    write_gltf(file, attributes, {})
+    header = json.loads(file.read_text())
+    header["materials"][0] |= mode
+    header["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [1, 1, 1, 0.4]
+    file.write_text(json.dumps(header))
+    mesh = gv.read_mesh(file)
+    (material,) = mesh.materials
+    assert material.texture[0, :, 3].tolist() == alpha
+    assert material.color[3] == pytest.approx(0.4 if mode == {"alphaMode": "BLEND"} else 1)
+    assert np.all(mesh.color[..., 3] == (0.5 if mode else 1))
+    del header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    file.write_text(json.dumps(header))
+    assert gv.read_mesh(file).materials[0].color[3] == pytest.approx(plain_alpha)
 
 
 def test_gltf_that_requires_what_is_not_read_is_refused(tmp_path):

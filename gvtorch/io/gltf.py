@@ -1,5 +1,6 @@
 """`plain_gltf`: checks a glTF file, and rewrites what trimesh would not read as the specification
-says: integers that stand for fractions, moved or second texture coordinates, and triangle fans.
+says: integers that stand for fractions, moved or second texture coordinates, colours of vertices
+that have a material, and triangle fans.
 
 Source: glTF 2.0 specification (Khronos), sections 3.6, 3.7 and 3.9; its extensions
 KHR_mesh_quantization and KHR_texture_transform.
@@ -8,6 +9,7 @@ KHR_mesh_quantization and KHR_texture_transform.
 from __future__ import annotations
 
 import base64
+import copy
 import json
 import struct
 from collections.abc import Callable
@@ -19,6 +21,8 @@ _COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TYPES = {width: name for name, width in _WIDTHS.items()}
 _FAN = 6  # the mode of a primitive
+#: The attribute that holds vertex colours: trimesh drops COLOR_0 where there is a material.
+COLORS = "_COLOR_0"
 #: Extensions that a file may require. Others pack or replace what is read here.
 _EXTENSIONS = (
     *("KHR_mesh_quantization", "KHR_texture_transform", "KHR_lights_", "KHR_materials_"),
@@ -42,15 +46,16 @@ def plain_gltf(content: bytes, packed: bool, read: Callable[[str], bytes]) -> by
     header_start = 20 if packed else 0
     header = json.loads(content[header_start : header_start + length])
     _check(header)
-    meshes = json.dumps(header.get("meshes"))
+    meshes = copy.deepcopy(header.get("meshes"))
     plain = _Plain(header, memoryview(content)[header_start + length + 8 :], read)
     for mesh in header.get("meshes", ()):
         for primitive in mesh["primitives"]:
             plain.rewrite(primitive)
-    if json.dumps(header.get("meshes")) == meshes:
+    if header.get("meshes") == meshes:
         return content
-    uri = "data:application/octet-stream;base64," + base64.b64encode(plain.added).decode()
-    header["buffers"].append({"byteLength": len(plain.added), "uri": uri})
+    if plain.added:
+        uri = "data:application/octet-stream;base64," + base64.b64encode(plain.added).decode()
+        header["buffers"].append({"byteLength": len(plain.added), "uri": uri})
     text = json.dumps(header).encode()
     if not packed:
         return text
@@ -94,13 +99,12 @@ class _Plain:
         texture = look.get("baseColorTexture", {})
         transform = texture.get("extensions", {}).get("KHR_texture_transform", {})
         chosen = transform.get("texCoord", texture.get("texCoord", 0))
-        sources = {name: attributes.get(name) for name in ("POSITION", "COLOR_0")}
-        sources["TEXCOORD_0"] = attributes.get(f"TEXCOORD_{chosen}")
-        for name, number in sources.items():
-            if number is None:
-                attributes.pop(name, None)
-            else:
+        sources = {"POSITION": "POSITION", "TEXCOORD_0": f"TEXCOORD_{chosen}", COLORS: "COLOR_0"}
+        for name, number in [(name, attributes.get(source)) for name, source in sources.items()]:
+            attributes.pop(name, None)
+            if number is not None:
                 attributes[name] = self._plain_accessor(name, number, transform)
+        attributes.pop("COLOR_0", None)
         if primitive.get("mode") == _FAN:
             self._split_fan(primitive)
 
@@ -130,12 +134,11 @@ class _Plain:
 
     def _plain_accessor(self, name: str, number: int, transform: dict[str, Any]) -> int:
         """Returns the number of an accessor of the same values as floats, texture coordinates moved
-        by `transform`; the same accessor if trimesh reads it right, as it does colours of 8 bits.
+        by `transform`; the same accessor if trimesh reads it right.
         """
         accessor = self.header["accessors"][number]
         transform = transform if name == "TEXCOORD_0" else {}
-        as_is = accessor["componentType"] == 5121 and name == "COLOR_0"
-        if (as_is or not accessor.get("normalized")) and not transform:
+        if not accessor.get("normalized") and not transform:
             return number
         key = number, json.dumps(transform)
         if key not in self._copies:

@@ -20,7 +20,7 @@ from ..base import check
 from ..base.image_info import array_from_srgb
 from ..base.messages import need_library, one_line
 from ..meshes.mesh import MOST_FACES, Material, Mesh
-from .gltf import plain_gltf
+from .gltf import COLORS, plain_gltf
 from .polygons import cut_polygons, plain_obj
 from .resources import amount, check_memory, memory_free
 
@@ -250,8 +250,10 @@ def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh
         uvs.append(
             np.zeros((len(part_faces), 3, 2)) if uv is None else np.asarray(uv)[part_faces][..., :2]
         )
-        colors.append(_colors(part, part_faces, ending))
         material = getattr(visual, "material", None)
+        colors.append(_colors(part, part_faces, ending))
+        if colors[-1] is not None and _alpha_mode(material, ending) == "OPAQUE":
+            colors[-1][..., 3] = 1
         if id(material) not in material_numbers:
             material_numbers[id(material)] = len(materials)
             materials.append(_material(path, material, ending, mapped and uv is not None))
@@ -282,13 +284,14 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
         colors = np.asarray(visual.vertex_colors)[faces]
     elif visual.kind == "face":
         colors = np.repeat(np.asarray(visual.face_colors)[:, None], 3, axis=1)
-    elif "color" in attributes and np.asarray(attributes["color"]).shape[-1] in (3, 4):
-        colors = np.asarray(attributes["color"])[faces]
     else:
-        return None
-    if colors.shape[-1] == 3:
-        colors = np.concatenate((colors, np.full_like(colors[..., :1], 255)), -1)
+        stored = attributes.get(COLORS, attributes.get("color"))
+        if stored is None or np.asarray(stored).shape[-1] not in (3, 4):
+            return None
+        colors = np.asarray(stored)[faces]
     linear = colors.astype(np.float32) / (255 if colors.dtype == np.uint8 else 1)
+    if linear.shape[-1] == 3:
+        linear = np.concatenate((linear, np.ones_like(linear[..., :1])), -1)
     if ending not in ("gltf", "glb"):
         linear[..., :3] = array_from_srgb(linear[..., :3])
     return linear
@@ -303,6 +306,16 @@ def _opacity(material: Any) -> float:
     except (KeyError, IndexError, ValueError):
         return 1.0
     return min(max(value if name == "d" else 1 - value, 0.0), 1.0)
+
+
+def _alpha_mode(material: Any, ending: str) -> str:
+    """Returns how a glTF material uses alpha: OPAQUE (it ignores it), MASK or BLEND; "" for others.
+
+    Source: glTF 2.0 specification (Khronos), section 3.9.4.
+    """
+    if material is None or ending not in ("gltf", "glb"):
+        return ""
+    return str(getattr(material, "alphaMode", None) or "OPAQUE")
 
 
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
@@ -329,6 +342,14 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
             texture = np.asarray(image.convert("RGBA"), np.uint8)
         except (OSError, ValueError, SyntaxError) as error:
             raise ValueError(f"{path}: a texture can't be read: {error}") from None
+    mode = _alpha_mode(material, ending)
+    if mode in ("OPAQUE", "MASK"):
+        cutoff = -1.0 if mode == "OPAQUE" else material.alphaCutoff
+        cutoff = 0.5 if cutoff is None else cutoff
+        if texture is not None:
+            is_seen = texture[..., 3] * color[3] >= 255 * cutoff
+            texture = np.concatenate((texture[..., :3], np.uint8(255) * is_seen[..., None]), -1)
+        color[3] = 1.0 if texture is not None else color[3] >= cutoff
     red, green, blue, opacity = (float(n) for n in color)
     name = str(getattr(material, "name", "") or "")
     return Material(name=name, color=(red, green, blue, opacity), texture=texture)
