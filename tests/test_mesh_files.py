@@ -151,8 +151,9 @@ def test_what_crosses_itself_is_a_fan_and_huge_polygons_are_refused(tmp_path):
         CUBE.replace(" ", "\t"),
         CUBE.replace("\n", "\n  "),
         CUBE.replace("\n", " # corner\n"),
+        "# made in C:\\models\\\n" + CUBE,
     ],
-    ids=["corners counted backwards", "tabs", "indents", "comments"],
+    ids=["corners counted backwards", "tabs", "indents", "comments", "a folder"],
 )
 def test_the_same_square_in_other_spellings_of_obj(tmp_path, text):
     (tmp_path / "a.obj").write_text(text)

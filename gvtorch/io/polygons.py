@@ -18,16 +18,18 @@ _STRAIGHT_TURN = 1e-9  # of the polygon's area: turns up to this count as straig
 
 
 def plain_obj(content: bytes) -> bytes:
-    """Returns an OBJ file without tabs, indented lines, lines that go on in the next one, comments
-    behind numbers, and corners that count backwards, from the vertex before their face.
+    """Returns an OBJ file without tabs, indented lines, comments, lines that go on in the next one,
+    and corners that count backwards, from the vertex before their face.
 
     Raises:
         ValueError: A corner counts back to a vertex before the first.
     """
-    content = content.replace(b"\r\n", b"\n").replace(b"\\\n", b" ").replace(b"\t", b" ")
+    content = content.replace(b"\r\n", b"\n").replace(b"\t", b" ")
     if content[:1] == b" " or b"\n " in content:
         content = re.sub(rb"(?m)^ +", b"", content)
+    # Before lines are joined: a comment may end in a backslash, as names of folders do.
     content = re.sub(rb"#[^\n]*", partial(_without_comment, content), content)
+    content = content.replace(b"\\\n", b" ")
     if not _CORNERS.search(content):
         return content
     starts = [
@@ -50,9 +52,10 @@ def plain_obj(content: bytes) -> bytes:
 
 
 def _without_comment(content: bytes, comment: re.Match[bytes]) -> bytes:
-    """Returns nothing for a comment behind numbers, else the same text: names may contain a #."""
+    """Returns nothing for a comment, but names as they are: they may contain a #."""
     line = content.rfind(b"\n", 0, comment.start()) + 1
-    return b"" if content[line : line + 2] in (b"f ", b"v ", b"vt", b"vn") else comment[0]
+    is_named = content[line : line + 2] not in (b"f ", b"v ", b"vt", b"vn")
+    return comment[0] if is_named and line < comment.start() else b""
 
 
 def cut_polygons(content: bytes) -> bytes:
