@@ -70,6 +70,22 @@ def test_several_sets_are_asked_about(tmp_path, grid):
         gv.read_volume(tmp_path / "none.h5:/a")
 
 
+def test_files_of_a_virtual_data_set_that_are_missing_are_told(tmp_path, grid):
+    """HDF5 fills in for them."""
+    layout = h5py.VirtualLayout((2, *grid.shape), grid.dtype)
+    for number, name in enumerate(("a.h5", "b.h5")):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["d"] = grid
+        layout[number] = h5py.VirtualSource(name, "d", grid.shape)
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file.create_virtual_dataset("d", layout)
+    assert open_source(tmp_path / "v.h5", axes="tzyx").dropped == ()
+    (tmp_path / "b.h5").unlink()
+    with pytest.warns(UserWarning, match=r"not kept: 1 files that are not there, such as b\.h5"):
+        volume = gv.read_volume(tmp_path / "v.h5", axes="tzyx", time=0)
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+
+
 def test_axes_of_ilastik_and_imagej(tmp_path):
     data = noise((2, 7, 9, 12, 3), "uint8")
     tags = {"axes": [{"key": k, "resolution": r} for k, r in zip("tzyxc", (0, 2, 3, 4, 0))]}  # noqa: B905
