@@ -132,6 +132,17 @@ def test_packed_values_and_missing_ones(tmp_path, grid):
     assert np.array_equal(volume.data[..., 0].numpy(), expected.astype("f4"))
 
 
+@pytest.mark.parametrize("attributes", [{"positive": "up"}, {"standard_name": "height"}])
+def test_heights_are_vertical(tmp_path, grid, attributes):
+    coords = {"height": ("height", 10.0 * np.arange(7), attributes | {"units": "m"})}
+    axes = ("time", "height", "lat", "lon")
+    xarray.Dataset({"v": (axes, grid[None])}, coords).to_netcdf(
+        tmp_path / "a.nc", engine="h5netcdf"
+    )
+    volume = gv.read_volume(tmp_path / "a.nc")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid) and volume.spacing[2] == 10
+
+
 def test_coordinates_may_be_packed(tmp_path, grid):
     """As those of GOES images are: small integers, with a factor and an offset."""
     steps = {"x": 0.25, "y": 2.0, "z": -0.5}

@@ -220,6 +220,8 @@ def _axes(
         names[axis] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
         kinds = (text_of(attributes.get(name)).lower() for name in ("axis", "standard_name"))
         kind = next(filter(None, kinds), "")
+        if kind == "height" or text_of(attributes.get("positive")):  # vertical, see CF, 4.3
+            kind = "z"
         names[axis] = kind if letter_of(kind) != "?" else names[axis]
         units[axis] = text_of(attributes.get("units")) or None
         note = text_of(attributes.get("NAME"))
