@@ -254,6 +254,19 @@ def test_texture_coordinates_of_gltf_are_chosen_and_moved(tmp_path, texture, mov
     assert mesh.corners.tolist() == POINTS[[[0, 1, 2], [0, 2, 3]]].tolist(), "a fan"
 
 
+def test_attributes_of_gltf_are_as_many_as_vertices(tmp_path):
+    file = tmp_path / "a.gltf"
+    write_gltf(file, {"POSITION": (POINTS[:3], False), "COLOR_0": (POINTS[:2], False)})
+    with pytest.raises(ValueError, match=r"a\.gltf: .*COLOR_0 has 2 values for 3 vertices"):
+        gv.read_mesh(file)
+    write_gltf(file, {"POSITION": (POINTS[:3], False)})
+    header = json.loads(file.read_text())
+    header["buffers"][0]["uri"] = "a\nb.bin"
+    file.write_text(json.dumps(header))
+    with pytest.raises(ValueError, match=r"a\.gltf: .*names a b\.bin, which is not there"):
+        gv.read_mesh(file)
+
+
 @pytest.mark.parametrize(
     ("mode", "alpha", "plain_alpha"),
     [

@@ -104,6 +104,13 @@ class _Plain:
             attributes.pop(name, None)
             if number is not None:
                 attributes[name] = self._plain_accessor(name, number, transform)
+                counts = [
+                    self.header["accessors"][attributes[n]]["count"] for n in ("POSITION", name)
+                ]
+                if counts[0] != counts[1]:
+                    raise ValueError(
+                        f"{name.lstrip('_')} has {counts[1]} values for {counts[0]} vertices"
+                    )
         attributes.pop("COLOR_0", None)
         if primitive.get("mode") == _FAN:
             self._split_fan(primitive)

@@ -191,8 +191,9 @@ class _FolderResolver:
         plain_name = str(name).strip().replace("\\", "/")
         if not (self._folder / plain_name).is_file():
             plain_name = unquote(plain_name)
+        shown = one_line(plain_name)
         if "://" in plain_name:
-            self.problem = f"names {plain_name}, and nothing is fetched"
+            self.problem = f"names {shown}, and nothing is fetched"
             raise ValueError(self.problem)
         file = (self._folder / plain_name).resolve()
         inside = file.is_relative_to(self._folder.resolve())
@@ -200,12 +201,12 @@ class _FolderResolver:
             problem = "is not there" if inside else "is in another folder"
             # An OBJ may name a material library that does not exist: the mesh is white then.
             if not plain_name.lower().endswith(".mtl"):
-                self.problem = f"names {plain_name}, which {problem}"
-            raise FileNotFoundError(f"{plain_name} {problem}")
+                self.problem = f"names {shown}, which {problem}"
+            raise FileNotFoundError(f"{shown} {problem}")
         self.images += file.suffix.lower() not in (".mtl", ".bin")
         self.size += file.stat().st_size
         try:
-            check_memory(f"names {plain_name}", self.size * _MEMORY_PER_BYTE)
+            check_memory(f"names {shown}", self.size * _MEMORY_PER_BYTE)
         except ValueError as error:
             self.problem = str(error)
             raise
