@@ -138,6 +138,11 @@ def test_resume_of_a_finished_store_says_so(tmp_path, raw, data):
         run = gvtorch("convert", *flags, "--resume")
         assert run.returncode == 2 and message in run.stderr, run.stderr
     assert listed(target) == before
+    series, one = np.stack([data] * 3), tmp_path / "one.zarr"
+    gv.convert(series, one, axes="tzyxc", time=1)
+    assert gv.convert(series, one, axes="tzyxc", time=1, resume=True).times == 1
+    with pytest.raises(ValueError, match="is finished, with times 1, now it is 3"):
+        gv.convert(series, one, axes="tzyxc", resume=True)
     raw.unlink()
     assert gvtorch("convert", raw, target, "--resume").returncode == 0
 

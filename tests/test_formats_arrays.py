@@ -134,6 +134,15 @@ def test_memory_maps_are_mapped_again(tmp_path, grid):
     assert np.array_equal(gv.read_volume(view).data[..., 0].numpy(), grid[2:])
 
 
+def test_dates_of_xarray_are_times(grid):
+    dates = np.datetime64("2026-11-30") + np.timedelta64(90, "m") * np.arange(3)
+    axes = ("time", "z", "y", "x")
+    series = xarray.DataArray(np.stack([grid] * 3), dims=axes, coords={"time": dates})
+    for times in (dates, dates - dates[0]):
+        info = gv.as_volume(series.assign_coords(time=times), time=1).info
+        assert (info.time_step, info.time_unit, info.time_origin) == (5400, "second", 0)
+
+
 def test_times_and_axes_are_asked_about(grid):
     four = np.stack([grid] * 3)
     with pytest.raises(ValueError, match=r"what are the axes of shape \(3, 7, 9, 12\)"):

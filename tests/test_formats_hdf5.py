@@ -71,6 +71,22 @@ def test_several_sets_are_asked_about(tmp_path, grid):
         gv.read_volume(tmp_path / "none.h5:/a")
 
 
+def test_files_of_a_virtual_data_set_that_are_missing_are_told(tmp_path, grid):
+    """HDF5 fills in for them."""
+    layout = h5py.VirtualLayout((2, *grid.shape), grid.dtype)
+    for number, name in enumerate(("a.h5", "b.h5")):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["d"] = grid
+        layout[number] = h5py.VirtualSource(name, "d", grid.shape)
+    with h5py.File(tmp_path / "v.h5", "w") as file:
+        file.create_virtual_dataset("d", layout)
+    assert open_source(tmp_path / "v.h5", axes="tzyx").dropped == ()
+    (tmp_path / "b.h5").unlink()
+    with pytest.warns(UserWarning, match=r"not kept: 1 files that are not there, such as b\.h5"):
+        volume = gv.read_volume(tmp_path / "v.h5", axes="tzyx", time=0)
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+
+
 def test_axes_of_ilastik_and_imagej(tmp_path):
     data = noise((2, 7, 9, 12, 3), "uint8")
     tags = {"axes": [{"key": k, "resolution": r} for k, r in zip("tzyxc", (0, 2, 3, 4, 0))]}  # noqa: B905
@@ -115,6 +131,33 @@ def test_packed_values_and_missing_ones(tmp_path, grid):
     volume = gv.read_volume(file, nan=-1)
     expected = np.where(np.isnan(values), -1, values)[::-1]
     assert np.array_equal(volume.data[..., 0].numpy(), expected.astype("f4"))
+
+
+@pytest.mark.parametrize("attributes", [{"positive": "up"}, {"standard_name": "height"}])
+def test_heights_are_vertical(tmp_path, grid, attributes):
+    coords = {"height": ("height", 10.0 * np.arange(7), attributes | {"units": "m"})}
+    axes = ("time", "height", "lat", "lon")
+    xarray.Dataset({"v": (axes, grid[None])}, coords).to_netcdf(
+        tmp_path / "a.nc", engine="h5netcdf"
+    )
+    volume = gv.read_volume(tmp_path / "a.nc")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid) and volume.spacing[2] == 10
+
+
+def test_coordinates_may_be_packed(tmp_path, grid):
+    """As those of GOES images are: small integers, with a factor and an offset."""
+    steps = {"x": 0.25, "y": 2.0, "z": -0.5}
+    sizes = dict(zip("zyx", grid.shape, strict=True))
+    coords = {name: (name, step * np.arange(sizes[name]) + 3) for name, step in steps.items()}
+    data = xarray.Dataset({"v": (("z", "y", "x"), grid)}, coords)
+    packing = {"dtype": "i2", "add_offset": 3.0, "_FillValue": -1}
+    encoding = {name: {**packing, "scale_factor": step} for name, step in steps.items()}
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf", encoding=encoding)
+    data.to_zarr(tmp_path / "a", encoding=encoding, consolidated=False)
+    for volume in (gv.read_volume(tmp_path / "a.nc"), gv.read_volume(tmp_path / "a", key="v")):
+        assert volume.spacing == (0.25, 2, 0.5)
+        assert volume.origin == (3, 3, 3 - 0.5 * (sizes["z"] - 1))
+        assert np.array_equal(volume.data[..., 0].numpy(), grid[::-1])
 
 
 @pytest.mark.parametrize(

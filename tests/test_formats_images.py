@@ -141,6 +141,26 @@ def test_mrc(tmp_path, grid, dtype, ending):
     assert open_source(file).whole == (kind is not None)
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_bytes_of_imod_have_no_sign_unless_it_says_so(tmp_path, grid, order):
+    """Its stamp and flags are at bytes 152 and 156 of the header."""
+    file, signed = tmp_path / "a.mrc", grid.astype("i1")
+    mrcfile.write(file, grid.astype(f"{order}i2"))
+    head = bytearray(file.read_bytes()[:1024])
+    head[12:16] = bytes(4)  # mode 0
+
+    def read(stamp, flags):
+        head[152:160] = np.array([stamp, flags], f"{order}i4").tobytes()
+        file.write_bytes(head + signed.tobytes())
+        return gv.read_volume(file).data[..., 0].numpy()
+
+    for flags, dtype in ((0, "u1"), (1, "i1"), (4 + 8, "u1")):
+        assert np.array_equal(read(1146047817, flags), signed.view(dtype))
+    assert np.array_equal(read(0, 0), signed), "not of IMOD"
+    with pytest.raises(ValueError, match="values of 4 bits"):
+        read(1146047817, 16)
+
+
 def test_mrc_axes_and_starts(tmp_path, grid):
     with mrcfile.new(tmp_path / "a.mrc", data=grid) as out:
         out.voxel_size = 2.0

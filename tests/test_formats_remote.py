@@ -108,6 +108,15 @@ def test_a_file_is_downloaded_once(tmp_path, server, grid, sized):
     assert len(server.sent) == 1 and len(kept(tmp_path)) == 1
 
 
+def test_blanks_and_letters_of_a_url_are_quoted(server, grid):
+    server.files["/x/sl%C3%A9%20%231.npy"] = server.files["/x/a.npy"]
+    volume = gv.read_volume(f"{server.url}/x/sl\u00e9 %231.npy?q= a")
+    assert np.array_equal(volume.data[..., 0].numpy(), grid)
+    assert server.sent == ["/x/sl%C3%A9%20%231.npy?q=%20a"]
+    with pytest.raises(OSError, match="can't be downloaded: nonnumeric port"):
+        gv.read_volume("http://localhost:port/a.npy")
+
+
 @pytest.mark.parametrize("by", ["tag", "modified"])
 def test_a_new_version_is_downloaded(tmp_path, server, grid, by):
     server.tag = server.modified = None
@@ -160,7 +169,7 @@ def test_the_cache_is_bounded_and_the_oldest_goes(tmp_path, server, grid, monkey
 
 def test_what_is_too_large_is_refused(tmp_path, server, grid, monkeypatch):
     monkeypatch.setenv("GVTORCH_CACHE_GB", "1e-6")
-    for server.sized, message in ((True, "is 0.0 MB, the cache"), (False, "is more than 0.0 MB")):
+    for server.sized, message in ((True, "is 1.6 kB, the cache"), (False, "is more than 1.0 kB")):
         with pytest.raises(OSError, match=message):
             gv.read_volume(f"{server.url}/x/a.npy")
     assert not kept(tmp_path)

@@ -75,6 +75,31 @@ def test_times_without_slices_and_a_store(tmp_path):
     assert store.info.unit == "nanometer" and store.width == 2
 
 
+def test_ome_tiff_of_several_files(tmp_path):
+    """A file per channel, each of which lists all."""
+    data = noise((2, 3, 20, 30), "uint16")
+    file = '<UUID FileName="{c}.tif">{c}</UUID>'
+    plane = f'<TiffData FirstC="{{c}}" FirstZ="{{z}}" IFD="{{z}}">{file}</TiffData>'
+    planes = "".join(plane.format(c=c, z=z) for c in range(2) for z in range(3))
+    sizes = " ".join(
+        f'Size{axis}="{n}"' for axis, n in zip("XYZCT", (30, 20, 3, 2, 1), strict=True)
+    )
+    for c in range(2):
+        xml = f'<OME UUID="{c}"><Image><Pixels {sizes} DimensionOrder="XYZCT" Type="uint16">'
+        xml += f"{planes}</Pixels></Image></OME>"
+        options = {"metadata": None, "photometric": "minisblack", "compression": "zlib"}
+        tifffile.imwrite(tmp_path / f"{c}.tif", data[c], description=xml, **options)
+    whole = np.moveaxis(data, 0, -1)
+    source = open_source(tmp_path / "1.tif")
+    assert np.array_equal(source.read_region((1, 2, 3), (3, 19, 20)), whole[1:, 2:19, 3:20])
+    store = convert(tmp_path / "0.tif", tmp_path / "a.zarr")
+    assert np.array_equal(store.read_region(0, (0, 0, 0), (3, 20, 30)), whole)
+    assert [Path(file).name for file in source.files] == [
+        "0.tif",
+        "1.tif",
+    ]  # `resume` compares them
+
+
 def test_several_series_and_pyramids(tmp_path):
     file = tmp_path / "a.ome.tif"
     fine, other = noise((3, 64, 64), "uint8"), noise((2, 5, 6), "uint8")
@@ -159,9 +184,17 @@ def test_turned_pages_and_centimeters_are_told(tmp_path):
     file = tmp_path / "a.tif"
     options = {"resolution": (2000, 2000), "resolutionunit": "CENTIMETER"}
     tifffile.imwrite(file, noise((3, 8, 9)), extratags=[(274, "H", 1, 6, False)], **options)
-    message = "size of a pixel in centimeters: .*; that its pages are to be shown turned"
+    message = (
+        "that its pages are to be shown turned or mirrored; the size of a pixel in centimeters"
+    )
     with pytest.warns(UserWarning, match=message):
         gv.read_volume(file)
+    (tmp_path / "s").mkdir()
+    tifffile.imwrite(
+        tmp_path / "s" / "0.tif", noise((1, 8, 9))[0], extratags=[(274, "H", 1, 6, False)]
+    )
+    with pytest.warns(UserWarning, match="not kept: that its pages are to be shown turned"):
+        gv.read_volume(tmp_path / "s")
 
 
 def test_a_file_that_ends_before_its_tiles(tmp_path):
@@ -206,6 +239,16 @@ def test_folders_of_pillow(tmp_path, ending, shape):
         assert [c.name for c in source.info.channels] == ["red", "green", "blue"]
     store = convert(folder, tmp_path / "a.zarr")
     assert np.array_equal(store.read_region(0, (0, 0, 0), (12, 40, 50)), actual)
+
+
+@pytest.mark.parametrize("ending", ["jpg", "tif"])
+def test_inks_are_no_light(tmp_path, ending):
+    data = noise((3, 9, 12, 4), "uint8")
+    for z, image in enumerate(data):
+        Image.fromarray(image, "CMYK").save(tmp_path / f"{z}.{ending}")
+    with pytest.warns(UserWarning, match="not kept: that its channels are inks"):
+        volume = gv.read_volume(tmp_path)
+    assert volume.data.shape[3] == 4 and volume.info.channels == ()
 
 
 def test_wide_png_of_simpleitk(tmp_path):

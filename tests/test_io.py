@@ -141,6 +141,8 @@ def test_nrrd_attached_and_detached(tmp_path):
     assert_is_grid(volume)
     assert volume.spacing == (2, 3, 4) and volume.origin == (1, 2, 3)
     assert_is_grid(gv.read_volume(tmp_path / "b.nhdr"))
+    nrrd.write(str(tmp_path / "50 %.nhdr"), grid(), {}, index_order="C")
+    assert_is_grid(gv.read_volume(tmp_path / "50 %.nhdr"))
     assert gv.read_volume(tmp_path / "b.nhdr").spacing == (2, 3, 4)
 
 

@@ -27,7 +27,7 @@ def test_the_bookkeeping_is_what_was_counted(blobs, channels, branching, monkeyp
     counted = []
     original = setup._check_memory
     monkeypatch.setattr(setup, "memory_free", lambda: 0)
-    with pytest.raises(ValueError, match=r"Engine: node_pool .*, their bookkeeping .* has 0\.0 MB"):
+    with pytest.raises(ValueError, match=r"Engine: node_pool .*, their bookkeeping .* has 0\.0 kB"):
         gv.Engine(producer, brick_pool="4 MB", node_pool="1 MB")
     monkeypatch.undo()
 

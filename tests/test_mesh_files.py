@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,174 @@ def test_what_crosses_itself_is_a_fan_and_huge_polygons_are_refused(tmp_path):
     (tmp_path / "b.obj").write_text(vertex_lines + "f " + " ".join(map(str, range(1, 1002))))
     with pytest.raises(ValueError, match="a polygon of 1001 corners is not convex, at most 1000"):
         gv.read_mesh(tmp_path / "b.obj")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf -4 -3 -2\nf -4 -2 -1\nv 9 9 9\nv 8 8 8\n",
+        CUBE.replace(" ", "\t"),
+        CUBE.replace("\n", "\n  "),
+        CUBE.replace("\n", " # corner\n"),
+        "# made in C:\\models\\\n" + CUBE,
+    ],
+    ids=["corners counted backwards", "tabs", "indents", "comments", "a folder"],
+)
+def test_the_same_square_in_other_spellings_of_obj(tmp_path, text):
+    (tmp_path / "a.obj").write_text(text)
+    corners = gv.read_mesh(tmp_path / "a.obj").corners
+    assert corners.tolist() == [
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
+        [[0, 0, 0], [1, 1, 0], [0, 1, 0]],
+    ]
+    (tmp_path / "b.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf -4 -2 -1\n")
+    with pytest.raises(ValueError, match=r"b\.obj: .*a corner -4 behind 3 vertices"):
+        gv.read_mesh(tmp_path / "b.obj")
+
+
+def write_gltf(file, attributes, texture=None, binary=False, **fields):
+    """Writes one primitive; `attributes` are an array and whether its integers are fractions."""
+    components = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "f4": 5126}
+    blob, views, accessors, primitive = b"", [], [], {"attributes": {}, **fields}
+    for name, (values, normalized) in attributes.items():
+        padded = np.zeros((len(values), 16 // values.itemsize), values.dtype)  # rows of 16 bytes
+        padded[:, : values.shape[1]] = values
+        place = {"byteOffset": len(blob), "byteLength": padded.nbytes, "byteStride": 16}
+        views.append({"buffer": 0, **place})
+        blob += padded.tobytes()
+        kind = {"type": f"VEC{values.shape[1]}", "componentType": components[values.dtype.str[1:]]}
+        counted = {"count": len(values), "normalized": normalized}
+        primitive["attributes"][name] = len(accessors)
+        accessors.append({"bufferView": len(views) - 1, **kind, **counted})
+    header = {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}]}
+    header |= {"meshes": [{"primitives": [primitive]}], "bufferViews": views}
+    header |= {"scene": 0, "accessors": accessors, "buffers": [{"byteLength": len(blob)}]}
+    if texture is not None:
+        header |= {"textures": [{"source": 0}], "images": [{"uri": "d%C3%A9%20ts.png"}]}
+        header["materials"] = [
+            {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, **texture}}}
+        ]
+        primitive["material"] = 0
+    if not binary:
+        header["buffers"][0]["uri"] = "numbers.bin"
+        (file.parent / "numbers.bin").write_bytes(blob)
+        file.write_text(json.dumps(header))
+        return
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    file.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 1]], np.float32)
+WIDE = {"i1": 127, "u1": 255, "i2": 32767, "u2": 65535}
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize("kind", WIDE)
+def test_integers_of_gltf_may_be_fractions(tmp_path, kind, binary):
+    """As the specification allows for texture coordinates and colours, and an extension for
+    positions.
+    """
+    file = tmp_path / ("a.glb" if binary else "a.gltf")
+    write_points(tmp_path / "d\u00e9 ts.png")
+    whole = {"POSITION": POINTS, "TEXCOORD_0": POINTS[:, :2], "COLOR_0": POINTS[:, [0, 1, 2, 0]]}
+    packed = {name: ((part * WIDE[kind]).astype(f"<{kind}"), True) for name, part in whole.items()}
+    write_gltf(file, packed, {}, binary, mode=5)
+    mesh = gv.read_mesh(file)
+    write_gltf(file, {name: (part, False) for name, part in whole.items()}, {}, binary, mode=5)
+    floats = gv.read_mesh(file)
+    for name in ("corners", "uv", "color"):
+        assert np.array_equal(getattr(mesh, name), getattr(floats, name)), name
+    assert np.array_equal(mesh.color[..., :3], np.clip(mesh.corners, 0, 1))
+    assert np.array_equal(np.unique(mesh.corners), [0, 1]) and len(mesh.faces) == 2
+
+
+def write_points(file):
+    from PIL import Image
+
+    Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3)).save(file)
+
+
+@pytest.mark.parametrize(
+    ("texture", "moved"),
+    [
+        ({}, lambda u, v: (u, v)),
+        ({"texCoord": 1}, lambda u, v: (u / 4, v / 2)),
+        ({"scale": [2, 3], "offset": [0.25, 0.5]}, lambda u, v: (2 * u + 0.25, 3 * v + 0.5)),
+        ({"rotation": np.pi / 2}, lambda u, v: (v, -u)),  # counter-clockwise, v points down
+        ({"rotation": np.pi / 2, "scale": [2, 3]}, lambda u, v: (3 * v, -2 * u)),
+    ],
+)
+def test_texture_coordinates_of_gltf_are_chosen_and_moved(tmp_path, texture, moved):
+    write_points(tmp_path / "d\u00e9 ts.png")
+    uv = POINTS[:, :2]
+    attributes = {"POSITION": POINTS, "TEXCOORD_0": uv, "TEXCOORD_1": uv / np.float32([4, 2])}
+    choice = {"extensions": {"KHR_texture_transform": texture}}
+    write_gltf(tmp_path / "a.gltf", {n: (a, False) for n, a in attributes.items()}, choice, mode=6)
+    mesh = gv.read_mesh(tmp_path / "a.gltf")
+    u, v = moved(*mesh.corners[..., :2].transpose(2, 0, 1))
+    assert np.allclose(mesh.uv, np.stack((u, 1 - v), -1), atol=1e-6)
+    assert mesh.corners.tolist() == POINTS[[[0, 1, 2], [0, 2, 3]]].tolist(), "a fan"
+
+
+def test_attributes_of_gltf_are_as_many_as_vertices(tmp_path):
+    file = tmp_path / "a.gltf"
+    write_gltf(file, {"POSITION": (POINTS[:3], False), "COLOR_0": (POINTS[:2], False)})
+    with pytest.raises(ValueError, match=r"a\.gltf: .*COLOR_0 has 2 values for 3 vertices"):
+        gv.read_mesh(file)
+    write_gltf(file, {"POSITION": (POINTS[:3], False)})
+    header = json.loads(file.read_text())
+    header["buffers"][0]["uri"] = "a\nb.bin"
+    file.write_text(json.dumps(header))
+    with pytest.raises(ValueError, match=r"a\.gltf: .*names a b\.bin, which is not there"):
+        gv.read_mesh(file)
+
+
+@pytest.mark.parametrize(
+    ("mode", "alpha", "plain_alpha"),
+    [
+        ({}, [255, 255, 255], 1),
+        ({"alphaMode": "MASK"}, [0, 0, 0], 0),
+        ({"alphaMode": "MASK", "alphaCutoff": 0.25}, [0, 255, 255], 1),
+        ({"alphaMode": "BLEND"}, [50, 200, 255], 0.4),
+    ],
+    ids=str,
+)
+def test_a_gltf_material_says_how_it_uses_alpha(tmp_path, mode, alpha, plain_alpha):
+    """By default it is opaque, whatever alpha is."""
+    from PIL import Image
+
+    file = tmp_path / "a.gltf"
+    pixels = np.array([[[9, 9, 9, a] for a in (50, 200, 255)]], np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "d\u00e9 ts.png")
+    attributes = {name: (POINTS[:3, :n], False) for name, n in (("POSITION", 3), ("TEXCOORD_0", 2))}
+    attributes["COLOR_0"] = (np.full((3, 4), 0.5, "f4"), False)
+    write_gltf(file, attributes, {})
+    header = json.loads(file.read_text())
+    header["materials"][0] |= mode
+    header["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [1, 1, 1, 0.4]
+    file.write_text(json.dumps(header))
+    mesh = gv.read_mesh(file)
+    (material,) = mesh.materials
+    assert material.texture[0, :, 3].tolist() == alpha
+    assert material.color[3] == pytest.approx(0.4 if mode == {"alphaMode": "BLEND"} else 1)
+    assert np.all(mesh.color[..., 3] == (0.5 if mode else 1))
+    del header["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+    file.write_text(json.dumps(header))
+    assert gv.read_mesh(file).materials[0].color[3] == pytest.approx(plain_alpha)
+
+
+def test_gltf_that_requires_what_is_not_read_is_refused(tmp_path):
+    write_gltf(tmp_path / "a.gltf", {"POSITION": (POINTS[:3], False)})
+    header = json.loads((tmp_path / "a.gltf").read_text())
+    for name in ("EXT_meshopt_compression", "KHR_materials_unlit"):
+        header["extensionsRequired"] = [name]
+        (tmp_path / f"{name}.gltf").write_text(json.dumps(header))
+    assert len(gv.read_mesh(tmp_path / "KHR_materials_unlit.gltf").faces) == 1
+    with pytest.raises(ValueError, match="it needs the extension EXT_meshopt_compression"):
+        gv.read_mesh(tmp_path / "EXT_meshopt_compression.gltf")
 
 
 def test_a_texture_is_laid_on(tmp_path):

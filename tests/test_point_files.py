@@ -162,7 +162,7 @@ def test_a_strange_ply_is_named(tmp_path, head, message):
 def test_text_beyond_an_integer_of_ply_is_refused(tmp_path, red):
     fields = "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
     fields = "".join(f"property float {axis}\n" for axis in "xyz") + fields
-    head = f"ply\nformat ascii 1.0\nelement vertex 1\n{fields}end_header\n"
+    head = f"ply\nformat ascii 1.0\ncomment M\u00fcller\nelement vertex 1\n{fields}end_header\n"
     (tmp_path / "a.ply").write_text(f"{head}1 2 3 {red} 0 0\n")
     if red == "255":
         assert gv.read_points(tmp_path / "a.ply").colors[0].tolist() == [1, 0, 0]
@@ -180,6 +180,13 @@ def test_missing_values_of_fits_are_no_numbers(tmp_path):
     with pytest.raises(ValueError, match="values must be finite, got NaN"):
         gv.read_points(tmp_path / "a.fits", values="flux")
     assert gv.read_points(tmp_path / "a.fits", values="mass").values[1] == 6
+    rows = np.zeros(2, [(name, ">i2") for name in ("x", "y", "z", "flux")])
+    rows["flux"] = 10, -99
+    table = fits.BinTableHDU(rows)
+    table.header.update({"TNULL4": -99, "TSCAL4": 0.5, "TZERO4": 3})  # what is stored is missing
+    table.writeto(tmp_path / "b.fits")
+    with pytest.raises(ValueError, match="values must be finite, got NaN"):
+        gv.read_points(tmp_path / "b.fits")
 
 
 def test_columns_of_another_length_are_told(tmp_path):

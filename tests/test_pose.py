@@ -269,6 +269,8 @@ def test_voxels_that_are_kept_tell_how_to_turn_them(tmp_path):
             np.testing.assert_allclose(pose.world_positions(local).numpy(), expected, atol=1e-5)
             assert np.array_equal(volume.data[..., 0].numpy(), data.T)
         assert volume.info.describe()["pose"]
+        store = gv.convert(volume, tmp_path / f"{mirrored}.zarr")
+        assert store.info.pose == gv.read_volume(store.location).info.pose == volume.info.pose
     sheared = affine.copy()
     sheared[:3, 0] += 0.3 * sheared[:3, 1]
     nibabel.save(nibabel.Nifti1Image(data, sheared), tmp_path / "a.nii")

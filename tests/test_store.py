@@ -452,6 +452,17 @@ def test_a_store_behind_http(served, data):
         Store.open(f"{served}/none.zarr")
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_server_is_asked_once_for_labels(tmp_path, version, monkeypatch):
+    write_foreign(tmp_path / "a", [noise((5, 6, 7))], "zyx", [[1.0] * 3], version=version)
+    asked: list[str] = []
+    answer = Handler.do_GET
+    monkeypatch.setattr(Handler, "do_GET", lambda self: (asked.append(self.path), answer(self)))
+    with serving(tmp_path) as url:
+        Store.open(f"{url}/a")
+    assert len([path for path in asked if "labels" in path]) == 1, asked
+
+
 def test_reads_end_in_time(served):
     store = Store.open(f"{served}/whole.zarr")
     Handler.delay = 1.5

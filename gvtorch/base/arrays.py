@@ -232,8 +232,10 @@ def _axis_metadata(
     for axis, name in enumerate(names):
         if name and name in coords:
             coordinate = coords[name]
-            steps[axis] = even_steps(name, coordinate.values, dropped)
-            units[axis] = str(coordinate.attrs.get("units", "")) or None
+            values, units[axis] = coordinate.values, str(coordinate.attrs.get("units", "")) or None
+            if values.dtype.kind in "mM" and values.size:  # xarray turns times of NetCDF into dates
+                values, units[axis] = (values - values[0]) / np.timedelta64(1, "s"), "second"
+            steps[axis] = even_steps(name, values, dropped)
     return names, steps, units, dropped
 
 

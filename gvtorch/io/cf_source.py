@@ -96,6 +96,14 @@ def cf_fields(dtype: np.dtype, attributes: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def unpack_coordinates(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:
+    """Returns the coordinates along an axis, which may be packed as other values are."""
+    fields = cf_fields(values.dtype, attributes)
+    if (scale := fields["scale"]) is None or values.dtype.kind not in "iuf":
+        return values
+    return values.view(fields["packed"]) * np.float64(scale[0]) + scale[1]
+
+
 def text_of(value: Any) -> str:
     """Returns an attribute as text; "" if it is none, or holds several values."""
     if isinstance(value, np.ndarray):

@@ -13,6 +13,7 @@ import os
 import re
 import socket
 import ssl
+import string
 import threading
 import time
 import urllib.error
@@ -255,9 +256,8 @@ def _send_request(
     """Sends a request; returns the connection (None if it is urllib's) and the answer, whose body
     is not read yet.
     """
-    url_parts = urllib.parse.urlsplit(url)
-    request_target = urllib.parse.quote(url_parts.path or "/", safe="/%:@!$&'()*+,;=~")
-    request_target += f"?{url_parts.query}" if url_parts.query else ""
+    url_parts = urllib.parse.urlsplit(_quoted(url))
+    request_target = url_parts.path + (f"?{url_parts.query}" if url_parts.query else "")
     proxied = url_parts.scheme in urllib.request.getproxies()
     if proxied and not urllib.request.proxy_bypass(url_parts.hostname or ""):
         return None, ask_by_urllib(url, headers, seconds)
@@ -279,10 +279,18 @@ def _send_request(
         return None, ask_by_urllib(url, headers, seconds)
 
 
+def _quoted(url: str) -> str:
+    """Returns a URL in which blanks and letters that are not ASCII are quoted."""
+    parts = urllib.parse.urlsplit(url)
+    path = urllib.parse.quote(parts.path or "/", "/%:@!$&'()*+,;=~")
+    query = urllib.parse.quote(parts.query, string.punctuation)
+    return urllib.parse.urlunsplit((parts.scheme, parts.netloc, path, query, ""))
+
+
 def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
     """Sends a request through proxies and redirections; raises as `read_http`, except Endless."""
-    request = urllib.request.Request(url, headers=headers)
     try:
+        request = urllib.request.Request(_quoted(url), headers=headers)
         response: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
     except urllib.error.HTTPError as error:
         error.close()
@@ -291,6 +299,8 @@ def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.cli
         if isinstance(error.reason, TimeoutError):
             raise TimeoutError(str(error.reason)) from None
         raise OSError(str(error.reason)) from None
+    except (http.client.HTTPException, ValueError) as error:  # no URL
+        raise OSError(one_line(error)) from None
     return response
 
 

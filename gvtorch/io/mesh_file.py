@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
 import math
 import zlib
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -20,9 +20,9 @@ from ..base import check
 from ..base.image_info import array_from_srgb
 from ..base.messages import need_library, one_line
 from ..meshes.mesh import MOST_FACES, Material, Mesh
-from .polygons import cut_polygons
+from .gltf import COLORS, plain_gltf
+from .polygons import cut_polygons, plain_obj
 from .resources import amount, check_memory, memory_free
-from .source import convert_errors
 
 #: Endings that are read, also followed by .gz. Other formats of trimesh need more libraries, or
 #: unpickle the content of files.
@@ -63,7 +63,10 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     _check_claims(path, ending, content)
     resolver: Any = _FolderResolver(path)
     try:
-        content = cut_polygons(content) if ending == "obj" else content
+        if ending == "obj":
+            content = cut_polygons(plain_obj(content))
+        if ending in ("gltf", "glb"):
+            content = plain_gltf(content, ending == "glb", resolver.get)
         options: Any = {"file_type": ending, "process": False, "allow_remote": False}
         loaded = trimesh.load(io.BytesIO(content), resolver=resolver, **options)
         _check_textures(_images(loaded), len(content) + resolver.size)
@@ -146,24 +149,6 @@ def _check_textures(images: list[Any], size: int) -> None:
         )
 
 
-def _check_gltf(ending: str, content: bytes) -> None:
-    """Raises ValueError for accessors that claim more values than their buffer holds, or whose
-    numbers trimesh would not find, and would read as zeros.
-    """
-    if ending == "glb":
-        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
-    header = json.loads(content)
-    for view in header.get("bufferViews", ()):
-        if min(view.get("byteOffset", 0), view["byteLength"]) < 0:
-            raise ValueError("a part of a buffer lies before its start")
-    for number, accessor in enumerate(header.get("accessors", ())):
-        if "bufferView" not in accessor or "sparse" in accessor:
-            raise ValueError(f"accessor {number} is sparse or packed by an extension")
-        length = header["bufferViews"][accessor["bufferView"]]["byteLength"]
-        if not 0 <= accessor["count"] <= length or accessor.get("byteOffset", 0) < 0:
-            raise ValueError(f"accessor {number} has {accessor['count']} values in {length} bytes")
-
-
 def _parse_count(word: bytes) -> int:
     """Returns the number in a header's word, 0 if it is none; 19 digits suffice to compare it."""
     return int(word.lstrip(b"0")[:19] or b"0") if word.isdigit() else 0
@@ -174,9 +159,6 @@ def _check_claims(path: Path, ending: str, content: bytes) -> None:
     file can hold, or than a mesh may have.
     """
     claimed = None
-    if ending in ("gltf", "glb"):
-        with convert_errors(ValueError, str(path), f"can't be read as {ending}"):
-            _check_gltf(ending, content)
     if ending == "stl" and len(content) >= 84 and not content[:5].lower() == b"solid":
         claimed = int.from_bytes(content[80:84], "little")
     if ending == "ply":
@@ -206,9 +188,12 @@ class _FolderResolver:
 
     def get(self, name: str) -> bytes:
         """Returns a file's content."""
-        plain_name = str(name).strip().replace("\\", "/").replace("%20", " ")
+        plain_name = str(name).strip().replace("\\", "/")
+        if not (self._folder / plain_name).is_file():
+            plain_name = unquote(plain_name)
+        shown = one_line(plain_name)
         if "://" in plain_name:
-            self.problem = f"names {plain_name}, and nothing is fetched"
+            self.problem = f"names {shown}, and nothing is fetched"
             raise ValueError(self.problem)
         file = (self._folder / plain_name).resolve()
         inside = file.is_relative_to(self._folder.resolve())
@@ -216,12 +201,12 @@ class _FolderResolver:
             problem = "is not there" if inside else "is in another folder"
             # An OBJ may name a material library that does not exist: the mesh is white then.
             if not plain_name.lower().endswith(".mtl"):
-                self.problem = f"names {plain_name}, which {problem}"
-            raise FileNotFoundError(f"{plain_name} {problem}")
+                self.problem = f"names {shown}, which {problem}"
+            raise FileNotFoundError(f"{shown} {problem}")
         self.images += file.suffix.lower() not in (".mtl", ".bin")
         self.size += file.stat().st_size
         try:
-            check_memory(f"names {plain_name}", self.size * _MEMORY_PER_BYTE)
+            check_memory(f"names {shown}", self.size * _MEMORY_PER_BYTE)
         except ValueError as error:
             self.problem = str(error)
             raise
@@ -266,8 +251,10 @@ def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh
         uvs.append(
             np.zeros((len(part_faces), 3, 2)) if uv is None else np.asarray(uv)[part_faces][..., :2]
         )
-        colors.append(_colors(part, part_faces, ending))
         material = getattr(visual, "material", None)
+        colors.append(_colors(part, part_faces, ending))
+        if colors[-1] is not None and _alpha_mode(material, ending) == "OPAQUE":
+            colors[-1][..., 3] = 1
         if id(material) not in material_numbers:
             material_numbers[id(material)] = len(materials)
             materials.append(_material(path, material, ending, mapped and uv is not None))
@@ -298,13 +285,14 @@ def _colors(part: Any, faces: np.ndarray, ending: str) -> np.ndarray | None:
         colors = np.asarray(visual.vertex_colors)[faces]
     elif visual.kind == "face":
         colors = np.repeat(np.asarray(visual.face_colors)[:, None], 3, axis=1)
-    elif "color" in attributes and np.asarray(attributes["color"]).shape[-1] in (3, 4):
-        colors = np.asarray(attributes["color"])[faces]
     else:
-        return None
-    if colors.shape[-1] == 3:
-        colors = np.concatenate((colors, np.full_like(colors[..., :1], 255)), -1)
+        stored = attributes.get(COLORS, attributes.get("color"))
+        if stored is None or np.asarray(stored).shape[-1] not in (3, 4):
+            return None
+        colors = np.asarray(stored)[faces]
     linear = colors.astype(np.float32) / (255 if colors.dtype == np.uint8 else 1)
+    if linear.shape[-1] == 3:
+        linear = np.concatenate((linear, np.ones_like(linear[..., :1])), -1)
     if ending not in ("gltf", "glb"):
         linear[..., :3] = array_from_srgb(linear[..., :3])
     return linear
@@ -319,6 +307,16 @@ def _opacity(material: Any) -> float:
     except (KeyError, IndexError, ValueError):
         return 1.0
     return min(max(value if name == "d" else 1 - value, 0.0), 1.0)
+
+
+def _alpha_mode(material: Any, ending: str) -> str:
+    """Returns how a glTF material uses alpha: OPAQUE (it ignores it), MASK or BLEND; "" for others.
+
+    Source: glTF 2.0 specification (Khronos), section 3.9.4.
+    """
+    if material is None or ending not in ("gltf", "glb"):
+        return ""
+    return str(getattr(material, "alphaMode", None) or "OPAQUE")
 
 
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
@@ -345,6 +343,14 @@ def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
             texture = np.asarray(image.convert("RGBA"), np.uint8)
         except (OSError, ValueError, SyntaxError) as error:
             raise ValueError(f"{path}: a texture can't be read: {error}") from None
+    mode = _alpha_mode(material, ending)
+    if mode in ("OPAQUE", "MASK"):
+        cutoff = -1.0 if mode == "OPAQUE" else material.alphaCutoff
+        cutoff = 0.5 if cutoff is None else cutoff
+        if texture is not None:
+            is_seen = texture[..., 3] * color[3] >= 255 * cutoff
+            texture = np.concatenate((texture[..., :3], np.uint8(255) * is_seen[..., None]), -1)
+        color[3] = 1.0 if texture is not None else color[3] >= cutoff
     red, green, blue, opacity = (float(n) for n in color)
     name = str(getattr(material, "name", "") or "")
     return Material(name=name, color=(red, green, blue, opacity), texture=texture)

@@ -166,23 +166,29 @@ def _read_fits(path: Path) -> dict[str, np.ndarray]:
             if table.size > limit:
                 raise ValueError(f"its rows take {table.size} bytes, at most {limit} can be there")
             return {
-                column.name: _with_gaps(np.asarray(table.data[column.name]), column.null)
+                column.name: _with_gaps(np.asarray(table.data[column.name]), column)
                 for column in table.columns
                 if column.format.lstrip("0123456789")[:1] in _FITS_TYPES
             }
 
 
-def _with_gaps(values: np.ndarray, null: Any) -> np.ndarray:
-    """Returns the values of a column, NaN where they are `null`, which means missing, if given."""
-    is_gap = values == null if isinstance(null, int) else np.zeros(1, bool)
-    return np.where(is_gap, np.nan, values) if is_gap.any() else values
+def _with_gaps(values: np.ndarray, column: Any) -> np.ndarray:
+    """Returns the values of a column, NaN where they are missing: where `null` is stored, if given,
+    which is scaled as they are.
+    """
+    null = column.null
+    if not isinstance(null, int):
+        return values
+    if values.dtype.kind == "f":
+        null = null * (column.bscale or 1) + (column.bzero or 0)
+    return np.where(values == null, np.nan, values) if (values == null).any() else values
 
 
 def _read_ply(path: Path) -> dict[str, np.ndarray]:
     """Returns the columns of the vertices; only binary rows of fixed size may precede them."""
     with path.open("rb") as file:
         header = file.read(_MAX_HEADER_BYTES)
-        lines = header.partition(b"end_header")[0].decode("ascii").splitlines()
+        lines = header.partition(b"end_header")[0].decode("latin-1").splitlines()
         start = header.find(b"\n", header.find(b"end_header")) + 1
         if not lines or lines[0].strip() != "ply" or start == 0:
             raise ValueError("it has no header of PLY")

@@ -1,22 +1,65 @@
-"""Cuts the polygons of OBJ files that are not convex into triangles inside them, before trimesh
-reads the file, because trimesh would make a fan around the first corner.
+"""Rewrites OBJ files before trimesh reads them: `plain_obj` what trimesh would not read, or not
+right, `cut_polygons` polygons that are not convex, of which it would make a fan around a corner.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
+from functools import partial
 
 import numpy as np
 
-_FACE = re.compile(rb"^[ \t]*f((?:[ \t]+[-\d/]+){4,})[ \t]*(?=\r?$)", re.MULTILINE)
-_VERTEX = re.compile(rb"^[ \t]*v[ \t]+(\S+)[ \t]+(\S+)[ \t]+(\S+)", re.MULTILINE)
+_CORNERS = re.compile(rb"^f [^\n]*-[^\n]*", re.MULTILINE)  # of a face with numbers below 0
+_FACE = re.compile(rb"^f((?: +[\d/]+){4,}) *$", re.MULTILINE)
+_VERTEX = re.compile(rb"^v +(\S+) +(\S+) +(\S+)", re.MULTILINE)
 _MAX_CORNERS = 1000  # of a polygon to cut: in the worst case, the time grows as their cube
 _STRAIGHT_TURN = 1e-9  # of the polygon's area: turns up to this count as straight
 
 
+def plain_obj(content: bytes) -> bytes:
+    """Returns an OBJ file without tabs, indented lines, comments, lines that go on in the next one,
+    and corners that count backwards, from the vertex before their face.
+
+    Raises:
+        ValueError: A corner counts back to a vertex before the first.
+    """
+    content = content.replace(b"\r\n", b"\n").replace(b"\t", b" ")
+    if content[:1] == b" " or b"\n " in content:
+        content = re.sub(rb"(?m)^ +", b"", content)
+    # Before lines are joined: a comment may end in a backslash, as names of folders do.
+    content = re.sub(rb"#[^\n]*", partial(_without_comment, content), content)
+    content = content.replace(b"\\\n", b" ")
+    if not _CORNERS.search(content):
+        return content
+    starts = [
+        np.array([match.start() for match in re.finditer(rb"(?m)^%s " % kind, content)])
+        for kind in (b"v", b"vt", b"vn")
+    ]
+
+    def count_forwards(match: re.Match[bytes]) -> bytes:
+        counts = [int(np.searchsorted(lines, match.start())) for lines in starts]
+        corners = []
+        for corner in match[0].split()[1:]:
+            pairs = [*zip(corner.split(b"/"), counts, strict=False)]
+            numbers = [int(n) + count + 1 if n[:1] == b"-" else n for n, count in pairs]
+            if any(isinstance(n, int) and n < 1 for n in numbers):
+                raise ValueError(f"a corner {corner.decode()} behind {counts[0]} vertices")
+            corners.append(b"/".join(b"%d" % n if isinstance(n, int) else n for n in numbers))
+        return b"f " + b" ".join(corners)
+
+    return _CORNERS.sub(count_forwards, content)
+
+
+def _without_comment(content: bytes, comment: re.Match[bytes]) -> bytes:
+    """Returns nothing for a comment, but names as they are: they may contain a #."""
+    line = content.rfind(b"\n", 0, comment.start()) + 1
+    is_named = content[line : line + 2] not in (b"f ", b"v ", b"vt", b"vn")
+    return comment[0] if is_named and line < comment.start() else b""
+
+
 def cut_polygons(content: bytes) -> bytes:
-    """Returns an OBJ file with triangles in place of the polygons that are not convex.
+    """Returns an OBJ file of `plain_obj` with triangles for the polygons that are not convex.
 
     Raises:
         ValueError: A position is no number, or such a polygon has more than 1000 corners.
@@ -31,8 +74,7 @@ def cut_polygons(content: bytes) -> bytes:
     triangulated: dict[int, tuple[re.Match[bytes], list[list[int]]]] = {}
     for count, matches in faces.items():
         tokens = re.sub(rb"/\S*", b"", b" ".join(match[1] for match in matches)).split()
-        corners = np.array(tokens, np.int64).reshape(-1, count)
-        corners = np.where(corners > 0, corners - 1, corners + len(vertices))
+        corners = np.array(tokens, np.int64).reshape(-1, count) - 1
         valid = np.flatnonzero(((corners >= 0) & (corners < len(vertices))).all(1))
         flat = _project(vertices[corners[valid]])
         for number in np.flatnonzero((_turns(flat) < -_STRAIGHT_TURN).any(1)).tolist():

@@ -18,8 +18,10 @@ Result = TypeVar("Result")
 
 
 def amount(nbytes: float) -> str:
-    """Formats a number of bytes for messages: "3.2 MB", "1.50 GB"."""
-    return f"{nbytes / 1e9:.2f} GB" if nbytes >= 1e9 else f"{nbytes / 1e6:.1f} MB"
+    """Formats a number of bytes for messages: "3.2 kB", "3.2 MB", "1.50 GB"."""
+    if nbytes >= 1e9:
+        return f"{nbytes / 1e9:.2f} GB"
+    return f"{nbytes / 1e6:.1f} MB" if nbytes >= 1e5 else f"{nbytes / 1e3:.1f} kB"
 
 
 def cores() -> int:

@@ -29,9 +29,12 @@ _LERC = 34887
 _PICTURE_COMPRESSIONS = (
     *JPEG, _LERC, 22610, 33003, 33004, 33005, 34712, 34933, 34934, 50001, 50002, 52546,
 )  # fmt: skip
+#: The note for pictures of inks, which are not light.
+INKS = "that its channels are inks (CMYK)"
 _PHOTOMETRIC_DROPPED = {  # by the tag PhotometricInterpretation
     0: "that high values are meant to be dark (MinIsWhite)",
     3: "the colours of its palette: values are numbers of its entries",
+    5: INKS,
 }
 _MAX_XML_CHARS = 1 << 28
 _MAX_PLANES = 1 << 16
@@ -77,10 +80,15 @@ def tiff_messages(log: list[logging.LogRecord], *, damage: bool = False) -> list
     return messages
 
 
-def photometric_dropped(series: Any) -> tuple[str, ...]:
-    """Returns what is not kept of how the numbers of a series are to be shown, a phrase or none."""
-    note = _PHOTOMETRIC_DROPPED.get(int(series.keyframe.photometric))
-    return () if note is None else (note,)
+def shown_as(series: Any, width: int) -> tuple[bool, list[str]]:
+    """Returns whether `width` numbers of a pixel are a colour, and what is not kept of how they are
+    to be shown.
+    """
+    photometric = int(series.keyframe.photometric)
+    dropped = [note for number, note in _PHOTOMETRIC_DROPPED.items() if number == photometric]
+    if series.keyframe.tags.valueof("Orientation", 1) != 1:
+        dropped.append("that its pages are to be shown turned or mirrored")
+    return width in (3, 4) and photometric in (2, 6), dropped  # RGB, YCbCr
 
 
 def _check_ome_xml(path: str, description: str) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
-from ..cf_source import CfSource, cf_fields
+from ..cf_source import CfSource, cf_fields, unpack_coordinates
 from ..source import Index, Triple, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
@@ -144,8 +144,10 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                 if coordinates.shape == (shape[axis],) and shape[axis] < 1 << 24:
                     future = begin_read(coordinates, files)
                     values = Deadline(_READ_TIMEOUT).wait(future, str(sibling))
+                    packing = _read_attributes(str(sibling))
+                    values = unpack_coordinates(values, packing)
                     steps[axis] = even_steps(name, values, dropped)
-                    units[axis] = str(_read_attributes(str(sibling)).get("units", "")) or None
+                    units[axis] = str(packing.get("units", "")) or None
     axis_order = axis_order or ask_axes(path, shape, axes)
     placement, info_fields = axes_placement(axis_order, shape, steps, units)
     quantity = attributes.get("units")

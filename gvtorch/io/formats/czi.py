@@ -33,7 +33,6 @@ class CziSource(VolumeSource):
 
     scene: int | None
     corner: tuple[int, int]  # x y of its rectangle
-    starts: tuple[tuple[str, int], ...]  # first index along each of T, C, Z
 
     def read_stored(self, index: Index) -> np.ndarray:
         from pylibCZIrw import czi
@@ -44,9 +43,7 @@ class CziSource(VolumeSource):
         with czi.open_czi(self.path) as file:
 
             def read(position: tuple[int, ...]) -> np.ndarray:
-                plane = {
-                    axis: first + n for n, (axis, first) in zip(position, self.starts, strict=True)
-                }
+                plane = dict(zip("TCZ", position, strict=True))
                 pixels = file.read(roi=roi, plane=plane, scene=self.scene)
                 if pixels.shape[2] == 3:
                     pixels = pixels[..., ::-1]  # blue comes first
@@ -75,7 +72,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
             scene = sorted(scenes)[chosen]
             bounds = scenes[scene]
     extra_axes = {
-        axis: b - a for axis, (a, b) in box.items() if axis not in "TCZXYSM" and b - a > 1
+        axis: count for axis, (_, count) in box.items() if axis not in "TCZXYSM" and count > 1
     }
     if extra_axes:
         axis_sizes = ", ".join(f"{name} {size}" for name, size in extra_axes.items())
@@ -85,8 +82,7 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
             f"{path}: pixels are {', '.join(map(str, pixel_types))}; expected one kind"
         )
     stored, colors = _DTYPES[pixel_types[0]]
-    starts = tuple((name, box.get(name, (0, 1))[0]) for name in "TCZ")
-    counts = [box.get(name, (0, 1))[1] - first for name, first in starts]
+    counts = [box[name][1] for name in "TCZ"]
     if counts[1] > 1 and colors > 1:
         raise ValueError(f"{path}: {counts[1]} channels of colours; expected one")
     info, spacing, dropped = _read_metadata(xml, counts[1], colors, stored)
@@ -100,7 +96,6 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
         dropped=(*dropped, *others),
         scene=scene,
         corner=(bounds.x, bounds.y),
-        starts=starts,
     )
 
 

@@ -20,7 +20,7 @@ from ...base.image_info import ChannelInfo, ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, letter_of, named_axes
 from ...base.units import spacing_of
 from ..budget import check_beside
-from ..cf_source import CfSource, cf_fields, text_of
+from ..cf_source import CfSource, cf_fields, text_of, unpack_coordinates
 from ..source import Index
 from .format import Format, not_chosen
 
@@ -62,6 +62,10 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         _check_dataset(path, name, dataset)
         shape = tuple(int(n) for n in dataset.shape)
         axis_order, steps, units, dropped = _axes(path, dataset, shape, axes)
+        sources = dataset.virtual_sources() if dataset.is_virtual else ()
+        names = sorted({source.file_name for source in sources} - {"."})
+        if missing := [name for name in names if not _other_files(path, name)]:
+            dropped.append(f"{len(missing)} files that are not there, such as {missing[0]}")
         info = _info(dataset, axis_order, shape)
         value_fields = cf_fields(dataset.dtype, dataset.attrs)
         placement, info_fields = axes_placement(axis_order, shape, steps, units)
@@ -136,14 +140,18 @@ def _check_other_file(path: str, file_name: str, name: str | None, links_left: i
     """
     import h5py
 
-    folder = os.path.realpath(os.path.dirname(path))
-    for candidate in {os.path.join(folder, file_name), os.path.abspath(file_name)}:
-        if not os.path.lexists(candidate):
-            continue
+    for candidate in _other_files(path, file_name):
         check_beside(path, candidate)
         if name is not None:
             with h5py.File(candidate, "r") as file:
                 _check_files(candidate, file, name, links_left - 1)
+
+
+def _other_files(path: str, file_name: str) -> list[str]:
+    """Returns where HDF5 may find a file that `path` refers to."""
+    folder = os.path.realpath(os.path.dirname(path))
+    candidates = {os.path.join(folder, file_name), os.path.abspath(file_name)}
+    return [candidate for candidate in candidates if os.path.lexists(candidate)]
 
 
 def _choose_dataset(path: str, file: Any, key: str | None) -> str:
@@ -212,16 +220,18 @@ def _axes(
         names[axis] = str(dimension.label or (scale.name.rpartition("/")[2] if scale else ""))
         kinds = (text_of(attributes.get(name)).lower() for name in ("axis", "standard_name"))
         kind = next(filter(None, kinds), "")
+        if kind == "height" or text_of(attributes.get("positive")):  # vertical, see CF, 4.3
+            kind = "z"
         names[axis] = kind if letter_of(kind) != "?" else names[axis]
         units[axis] = text_of(attributes.get("units")) or None
-        if text_of(attributes.get("NAME")).startswith("This is a netCDF dimension but not"):
-            continue
-        if scale is None:
+        note = text_of(attributes.get("NAME"))
+        if scale is None or note.startswith("This is a netCDF dimension but not"):
             continue
         _check_sources(path, scale)
         is_fitting = scale.shape == shape[axis : axis + 1] and scale.dtype.kind in "iuf"
         if is_fitting and shape[axis] <= _MAX_COORDINATES:
-            steps[axis] = even_steps(names[axis], scale[()], dropped)
+            coordinates = unpack_coordinates(scale[()], attributes)
+            steps[axis] = even_steps(names[axis], coordinates, dropped)
     tags = _tags(dataset)
     if len(tags) == rank:
         names = [str(tag.get("key", "")) for tag in tags]

@@ -24,7 +24,7 @@ from ..picture_size import has_jpeg_end, picture_size
 from ..resources import check_memory
 from ..source import Index, VolumeSource, convert_errors
 from ..stores.ngff import is_zarr
-from ..tiff_info import check_pictures, opened_tiff, photometric_dropped
+from ..tiff_info import INKS, check_pictures, opened_tiff, shown_as
 from .format import Format
 
 _TIFF_ENDINGS = (".tif", ".tiff")
@@ -91,20 +91,22 @@ def open_folder(path: str) -> SlicesSource:
     first = _decode_image(str(files[0]))
     if first.ndim not in (2, 3):
         raise ValueError(f"{files[0]}: expected one slice (y, x) or (y, x, c), got {first.shape}")
-    info, dropped = ImageInfo(), tuple[str, ...]()
-    if files[0].suffix.lower() in _TIFF_ENDINGS:
+    width, dropped = (*first.shape, 1)[2], list[str]()
+    kind = _KINDS[files[0].suffix.lower()]
+    is_color = width == 3 or (width == 4 and kind == "png")
+    if kind == "tiff":
         with _opened_slice(str(files[0])) as (series, _):
-            dropped = photometric_dropped(series)
-    if first.ndim == 3 and first.shape[2] in (3, 4):
-        info = ImageInfo(channels=color_channels(first.shape[2]))
+            is_color, dropped = shown_as(series, width)
+    elif kind == "jpeg8" and width == 4:
+        dropped.append(INKS)
     return SlicesSource(
         path=path,
         shape=(len(files), *first.shape),
         axes="zyxc"[: 1 + first.ndim],
         stored=first.dtype.str,
         files=tuple(str(file) for file in files),
-        info=info,
-        dropped=dropped,
+        info=ImageInfo(channels=color_channels(width) if is_color else ()),
+        dropped=tuple(dropped),
     )
 
 

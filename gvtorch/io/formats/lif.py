@@ -85,6 +85,7 @@ def _image_source(
         path=path,
         shape=tuple(axis.size for axis in axes),
         axes="".join(axis.letter for axis in axes),
+        flips="".join(axis.letter for axis in axes if axis.letter == "z" and axis.backwards),
         stored=stored,
         spacing=spacing,
         info=microscope_info(unit, infos, len(infos), steps.get("t"), "second"),
@@ -109,6 +110,7 @@ class _Axis(NamedTuple):
     stride: int  # bytes
     step: float | None = None  # between two values, in `unit`
     unit: str | None = None
+    backwards: bool = False
 
 
 def _axis(path: str, element: Any) -> _Axis:
@@ -120,7 +122,9 @@ def _axis(path: str, element: Any) -> _Axis:
         raise ValueError(f"{path}: an image of {size} {name} is not known here")
     length = float(element.get("Length") or 0)
     step = abs(length) / (size - 1) if size > 1 and length else None
-    return _Axis(letter, size, int(element.get("BytesInc", 0)), step, element.get("Unit"))
+    return _Axis(
+        letter, size, int(element.get("BytesInc", 0)), step, element.get("Unit"), length < 0
+    )
 
 
 def _channel_axis(path: str, channels: list[Any]) -> _Axis:

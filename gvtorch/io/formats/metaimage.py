@@ -60,12 +60,13 @@ def open_metaimage(path: str) -> VolumeSource:
         **_placement(path, header, shape, width),
     }
     data_name = header["ElementDataFile"]
-    if data_name.upper() == "LIST" or "%" in data_name:
+    data_file = str(Path(path).parent / data_name)
+    if data_name.upper() == "LIST" or ("%" in data_name and not os.path.exists(data_file)):
         raise ValueError(
             f"{path}: its slices are in separate files (ElementDataFile = {data_name})"
         )
     is_local = data_name.upper() == "LOCAL"
-    data_file = path if is_local else str(Path(path).parent / data_name)
+    data_file = path if is_local else data_file
     header_size = int(header.get("HeaderSize", 0))
     start = header_size if header_size > 0 else end if is_local else 0
     if "BinaryData" in header and not _is_true(header, "BinaryData"):

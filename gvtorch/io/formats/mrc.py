@@ -1,6 +1,7 @@
 """MRC and CCP4 maps, whose header mrcfile reads: by region, or whole if the file is packed.
 
-Source: Cheng et al., "MRC2014: extensions to the MRC format header", J. Struct. Biol. 2015.
+Source: Cheng et al., "MRC2014: extensions to the MRC format header", J. Struct. Biol. 2015;
+"The MRC file format used by IMOD" (bio3d.colorado.edu/imod), imodStamp and imodFlags.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from ..source import ArraySource, place_axes
 from .format import Format
 
 _PACKED_ENDINGS = (".gz", ".bz2")
+_IMOD_STAMP, _SIGNED_BYTES, _HALF_BYTES = 1146047817, 1, 16  # and flags beside the stamp
 _DTYPES = {0: "i1", 1: "i2", 2: "f4", 6: "u2", 12: "f2"}
 
 
@@ -39,8 +41,14 @@ def open_mrc(path: str) -> ArraySource:
         raise ValueError(serious[0])
     sizes = [int(fields[name]) for name in ("nz", "ny", "nx")]
     number_dtype = _DTYPES.get(int(fields["mode"]))
+    byte_order = "<" if order in "<=|" else ">"
+    stamp, flags = np.frombuffer(fields["extra2"].tobytes(), f"{byte_order}i4", 2, 40).tolist()
     if number_dtype is None:
         raise ValueError(f"{path}: mode {int(fields['mode'])}; expected one of {sorted(_DTYPES)}")
+    if number_dtype == "i1" and stamp == _IMOD_STAMP:
+        if flags & _HALF_BYTES:
+            raise ValueError(f"{path}: holds IMOD's values of 4 bits, two in a byte")
+        number_dtype = "i1" if flags & _SIGNED_BYTES else "u1"
     if int(fields["nsymbt"]) < 0:
         raise ValueError(f"{path}: an extended header of {int(fields['nsymbt'])} bytes")
     is_stack = int(fields["ispg"]) > 400 and int(fields["mz"]) > 0
@@ -55,7 +63,7 @@ def open_mrc(path: str) -> ArraySource:
         path=path,
         file=path,
         shape=tuple(sizes),
-        stored=np.dtype(("<" if order in "<=|" else ">") + number_dtype).str,
+        stored=np.dtype(byte_order + number_dtype).str,
         offset=1024 + int(fields["nsymbt"]),
         whole=path.lower().endswith(_PACKED_ENDINGS),
         info=ImageInfo(unit=unit),

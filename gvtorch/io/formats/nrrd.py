@@ -84,7 +84,9 @@ def open_nrrd(path: str, axes: str | None = None) -> VolumeSource:
     skip_bytes = int(header.get("byte skip", 0))
     skip_lines = int(header.get("line skip", 0))
     if data_name is not None and (
-        not isinstance(data_name, str) or data_name.startswith("LIST") or "%" in data_name
+        not isinstance(data_name, str)
+        or data_name.startswith("LIST")
+        or ("%" in data_name and not (Path(path).parent / data_name).exists())
     ):
         raise ValueError(f"{path}: its numbers lie in several files (data file: {data_name})")
     if skip_bytes < -1 or skip_lines < 0 or (skip_bytes == -1 and encoding != "raw"):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..tiff_info import (
     imagej_info,
     ome_info,
     opened_tiff,
-    photometric_dropped,
+    shown_as,
     tiff_messages,
 )
 from .format import Format, choose
@@ -35,6 +36,7 @@ class TiffSource(VolumeSource):
     """A series of packed pages; reading a part unpacks only the tiles and strips that it needs."""
 
     series: int = 0
+    files: tuple[str, ...] = ()  # that hold its pages, if they are several
 
     def read_stored(self, index: Index) -> np.ndarray:
         with opened_tiff(self.path) as (file, _):
@@ -68,11 +70,27 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
         height, across = keyframe.tilelength, keyframe.tilewidth
     low, high = boxes.box_of(index[:2])
     out = np.zeros((*np.subtract(high, low), samples), keyframe.dtype)
-    for row, column in boxes.tile_indices(low, high, (height, across)):
-        tile = _unpack_tile(page, keyframe, row * -(-width // across) + column)
-        if tile is not None:
-            boxes.paste(out, low, tile, (row * height, column * across))
+    with _opened(page.parent.filehandle):
+        for row, column in boxes.tile_indices(low, high, (height, across)):
+            tile = _unpack_tile(page, keyframe, row * -(-width // across) + column)
+            if tile is not None:
+                boxes.paste(out, low, tile, (row * height, column * across))
     return out[..., index[2]] if len(index) == 3 else out[..., 0]
+
+
+@contextmanager
+def _opened(file: Any) -> Iterator[None]:
+    """Opens a file for as long as it is needed: tifffile closes those beside the one it opened,
+    which hold further planes of an OME-TIFF.
+    """
+    was_closed = file.closed
+    if was_closed:
+        file.open()
+    try:
+        yield
+    finally:
+        if was_closed:
+            file.close()
 
 
 def _unpack_tile(page: Any, keyframe: Any, tile_number: int) -> np.ndarray | None:
@@ -119,6 +137,9 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         by_page &= axes[leading:].replace("-", "") in ("yx", "yxc") and "-" not in axes[leading:]
         keyframe = series.keyframe
         piece_values = int(np.prod(keyframe.chunks)) if by_page else math.prod(shape)
+        if series.is_multifile:
+            handles = (page.parent.filehandle for page in series.pages if page is not None)
+            fields["files"] = tuple(sorted({handle.path for handle in handles}))
         missing_pages = sum(page is None for page in series.pages)
         if missing_pages:
             dropped.append(f"{missing_pages} of {len(series.pages)} pages, which are not there")
@@ -153,10 +174,8 @@ def _read_metadata(
     width = shape[axes.index("c")] if "c" in axes else 1
     if series.kind == "ome":
         return ome_info(file.ome_metadata, number, series.name, width)
-    photometric = int(series.keyframe.photometric)
-    is_color = width in (3, 4) and photometric in (2, 6)  # RGB, YCbCr
+    is_color, dropped = shown_as(series, width)
     channels = color_channels(width) if is_color else ()
-    dropped = [*photometric_dropped(series)]
     if series.kind == "imagej":
         info, spacing, also_dropped = imagej_info(file.imagej_metadata, _resolution(file), width)
         info = replace(info, channels=channels) if is_color else info
@@ -166,8 +185,6 @@ def _read_metadata(
     tags = series.keyframe.tags
     if "XResolution" in tags and tags.valueof("ResolutionUnit", 2) == 3:  # inches are for printers
         dropped.append("the size of a pixel in centimeters: the distance between pages is missing")
-    if tags.valueof("Orientation", 1) != 1:
-        dropped.append("that its pages are to be shown turned or mirrored")
     return ImageInfo(channels=channels), (1.0, 1.0, 1.0), dropped
 
 

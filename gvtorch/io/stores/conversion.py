@@ -83,7 +83,7 @@ def convert(
         workers: Number of processes in that pool. If left out, one per core, as memory permits.
         memory: Most bytes of all processes, as in "2 GB"; limits the workers. Left out, all free.
         resume: Continue a half-written store. A finished one is returned as it is, if its grid,
-            dtype, block and threshold are those requested; its voxels are not compared.
+            times, dtype, block and threshold are those requested; its voxels are not compared.
         progress: Called with ("converting", bytes done, bytes in all).
         **options: shape, dtype, offset, key and axes, as for `read_volume`.
 
@@ -101,7 +101,9 @@ def convert(
     make_source = partial(source_of, source, spacing, origin, time, oblique, labels, options)
     if resume and unfinished.is_finished(target) and (finished := Store.open(target)).has_blocks:
         with suppress(FileNotFoundError):  # the source may be gone once the store is finished
-            _check_finished(finished, make_source(read=False), block, threshold)
+            opened = make_source(read=False)
+            times = opened.times if time is None else 1
+            _check_finished(finished, opened, times, block, threshold)
         shutil.rmtree(target / WORK, ignore_errors=True)  # left if it was killed in its last step
         return finished
     begun = unfinished.is_begun(target, resume=resume)
@@ -116,7 +118,7 @@ def convert(
 
 
 def _check_finished(
-    store: Store, source: VolumeSource, block: int, threshold: float | None
+    store: Store, source: VolumeSource, times: int, block: int, threshold: float | None
 ) -> None:
     """Raises ValueError if a finished store differs from the one that would be written."""
     is_labels = source.info.labels
@@ -124,6 +126,7 @@ def _check_finished(
         ("extent", store.layout.extent, source.extent),
         ("spacing", store.spacing, source.spacing),
         ("origin", store.origin, source.origin),
+        ("times", store.times, times),
         ("channels", store.layout.width, source.width),
         ("labels", store.info.labels, is_labels),
         ("dtype", None if is_labels else store.layout.dtype, None if is_labels else source.dtype),

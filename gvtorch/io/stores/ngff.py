@@ -14,7 +14,7 @@ from pathlib import Path
 from reprlib import repr as brief
 from typing import Any
 
-from ...base.image_info import ChannelInfo, ImageInfo, Rgb, from_hex, to_hex
+from ...base.image_info import ChannelInfo, ImageInfo, Rgb, Rows, from_hex, to_hex
 from ...base.units import length_unit, metres, time_unit
 from ..http import Endless, file_url, is_forbidden, refused
 from ..remote import is_file_url
@@ -93,7 +93,7 @@ def find_image(
     if layout is not None:
         pyramid.store_json = group["gvtorch"]
         pyramid.info = _stored_info(pyramid.store_json.get("info"), pyramid.info)
-    pyramid.dropped += _label_notes(location, root, deadline)
+    pyramid.dropped += _label_notes(location, root, group, deadline)
     return root, pyramid, layout
 
 
@@ -247,13 +247,19 @@ def _image_folders(
     return [folder for folder in folders if isinstance(folder, str)] or ["0"]
 
 
-def _label_notes(location: str, root: Any, deadline: Deadline) -> list[str]:
-    """Returns a phrase on the label images in the image's group `labels`, if it has any."""
+def _label_notes(
+    location: str, root: Any, attributes: dict[str, Any], deadline: Deadline
+) -> list[str]:
+    """Returns a phrase on the label images in the image's group `labels`, if it has any. That group
+    has the same version of Zarr as the image, so a server is asked for one file.
+    """
+    name = "zarr.json" if "ome" in attributes else ".zattrs"
     try:
-        group = _attributes(f"{location}/labels", child(root, "labels"), deadline) or {}
+        group = read_json(f"{location}/labels", child(root, "labels"), name, deadline) or {}
     except (OSError, ValueError):
         return []
-    labels = _ngff_attribute(group, "labels")
+    group = group.get("attributes", group)
+    labels = _ngff_attribute(group, "labels") if isinstance(group, dict) else None
     if not isinstance(labels, list) or not labels:
         return []
     return [f"the labels {_join_some([f'labels/{name}' for name in labels])}"]
@@ -269,7 +275,16 @@ def _stored_info(stored: Any, info: ImageInfo) -> ImageInfo:
         quantity=quantity if isinstance(quantity, str) else None,
         space=space if isinstance(space, str) else None,
         labels=stored.get("labels") is True,
+        pose=_parse_pose(stored.get("pose")),
     )
+
+
+def _parse_pose(rows: Any) -> Rows | None:
+    """Returns a (4, 4) matrix of numbers; None for anything else."""
+    is_list = isinstance(rows, list) and len(rows) == 4 and all(isinstance(r, list) for r in rows)
+    if not is_list or not all(len(row) == 4 and all(map(is_number, row)) for row in rows):
+        return None
+    return tuple(tuple(map(float, row)) for row in rows)
 
 
 def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> MultiscaleImage:
@@ -409,6 +424,7 @@ def image_metadata(
         "multiscales": [{"name": name, "type": method, "axes": axes, "datasets": datasets}],
     }
     extras: dict[str, Any] = {"quantity": info.quantity, "space": info.space, "labels": info.labels}
+    extras["pose"] = info.pose
     if info.channels:
         ome["omero"], extras["assumed"] = _write_channels(info.channels, layout.value_range or ())
     return ome, {key: value for key, value in extras.items() if value}
