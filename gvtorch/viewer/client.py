@@ -25,6 +25,7 @@ _SHOW_SECONDS = 0.3  # seconds between pictures of a camera at rest
 _DRAFT_QUALITY, _FINAL_QUALITY = 80, 94  # JPEG quality
 _CHEAP_PIXELS = 200_000  # pixels up to which the final quality costs little
 _MIN_DRAFT_SCALE = 0.1  # least fraction of the width and height, of a draft
+_LATE_DRAFT_MS = 250.0  # milliseconds after which a draft is given up for something newer
 _UNCHANGED_FRAMES = 3  # frames without new data, after which a picture counts as finished
 
 
@@ -163,14 +164,14 @@ class Client:
         `is_outdated` returned true, or if only the planes have changed.
         """
         self._planes, self._scene_time = planes if state.slices is not None else None, scene.time
-        if self._draft_key != (self.eye, self.size):
-            return self._draw_draft(scene, state)
-        if self._planes_changed and self._last_shown is not None and self._camera is not None:
+        is_draft = self._draft_key != (self.eye, self.size)
+        if not is_draft and self._planes_changed and self._last_shown is not None:
             picture, elapsed_ms, final = self._last_shown
             self._send_picture(picture, state, _FINAL_QUALITY, elapsed_ms, final)
             return None
         try:
-            return self._draw_refined(scene, state, is_outdated)
+            draw = self._draw_draft if is_draft else self._draw_refined
+            return draw(scene, state, is_outdated)
         except Interrupted:
             return None
 
@@ -178,7 +179,20 @@ class Client:
         """Returns (width, height) of the picture without the planes beside it."""
         return self.size if self._planes is None else panes(*self.size)["view"][2:]
 
-    def _draw_draft(self, scene: Scene, state: ViewState) -> Picture:
+    def _draw_draft(
+        self, scene: Scene, state: ViewState, is_outdated: Callable[[], bool]
+    ) -> Picture:
+        """Draws a picture of as many pixels as fit in the time of a frame. If it takes much longer
+        and something newer is to be shown, it is given up, and the next has fewer pixels.
+        """
+
+        def stop_if_late(_stage: str, done: int, total: int) -> None:
+            late_ms = 1e3 * (time.perf_counter() - start)
+            is_late = late_ms > _LATE_DRAFT_MS and scale > _MIN_DRAFT_SCALE
+            if done < total and (self.gone or (is_late and is_outdated())):
+                self._pixel_ms = late_ms / (done * size[0])
+                raise Interrupted
+
         width, height = self._view_size()
         frame_ms = 1e3 / self.rate
         pixels_ms = max(frame_ms - self._fixed_ms, frame_ms / 2)
@@ -186,7 +200,7 @@ class Client:
         scale = min(1.0, max(_MIN_DRAFT_SCALE, scale))
         size = max(1, round(width * scale)), max(1, round(height * scale))
         camera, start = self.eye.camera(*size, scene.box), time.perf_counter()
-        picture = scene.frame(camera, state)
+        picture = scene.frame(camera, state, stop_if_late)
         elapsed_ms = 1e3 * (time.perf_counter() - start)
         self._update_costs(picture, elapsed_ms, size[0] * size[1])
         self._draft_key, self._progressive = (self.eye, self.size), None

@@ -151,6 +151,8 @@ class Session:
             if self._closed:
                 return
             self._closed = True
+            for client in list(self.clients.values()):
+                client.gone = True  # ends work for it
             self._wake.notify()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=30)
@@ -464,6 +466,12 @@ class Session:
     def _take_histogram(self, client: Client, message: protocol.Histogram) -> None:
         histogram = self.scene.histogram(self.state.component, message.in_view)
         client.send_message("histogram", **histogram)
+
+    def _take_find(self, client: Client, message: protocol.Find) -> None:
+        labels = self.scene.describe_labels(message.text)
+        if labels is None:
+            raise ValueError("find: this scene has no labels")
+        client.send_message("found", text=message.text, **labels)
 
     def _take_preset(self, client: Client, message: protocol.Preset) -> None:
         name = message.name
