@@ -48,7 +48,8 @@ class Client:
         picture: Its last picture, or None.
         monitor: Whether it receives figures of the frames.
         nodes: Whether it receives boxes of the nodes of each frame.
-        gone: Whether it has left.
+        planes_changed: Whether planes beside its picture have changed, but not the picture.
+        gone: Whether it has left, or the view is closed: ends work for it.
     """
 
     def __init__(self, number: int, send: Send, eye: Eye) -> None:
@@ -56,7 +57,7 @@ class Client:
         self.number, self._send = number, send
         self.eye, self.size, self.rate = eye, (0, 0), 25.0
         self.follows: int | None = None
-        self.monitor = self.nodes = self.gone = False
+        self.monitor = self.nodes = self.gone = self.planes_changed = False
         self._moving, self._move_time, self._move_clock = False, 0.0, 0.0
         self._draft_key: tuple[Any, ...] | None = None  # (eye, size) of the last draft
         self._progressive: Progressive | None = None
@@ -64,7 +65,6 @@ class Client:
         self._last_sent_time = self._paused_until = 0.0
         # Developed picture, milliseconds that it took, and whether it is final.
         self._last_shown: tuple[Picture, float, bool] | None = None
-        self._planes_changed = False  # whether planes beside it have changed
         self._pixel_ms, self._fixed_ms = 5e-4, 0.0  # cost of a pixel; of a frame in addition
         self.picture: Picture | None = None
         self._camera: Camera | None = None
@@ -119,10 +119,6 @@ class Client:
         self.eye, self._moving, self._finished = eye, moving, False
         self._move_time, self._move_clock = time.monotonic(), sent
 
-    def mark_planes_changed(self) -> None:
-        """Notes that planes beside the picture have changed, but not the picture."""
-        self._planes_changed = True
-
     def restart(self, resting: bool) -> None:
         """Restarts the picture after a change; unless `resting`, as if the camera moved."""
         self._progressive, self._finished, self._draft_key = None, False, None
@@ -146,11 +142,11 @@ class Client:
         """Returns whether a picture is to be drawn now."""
         if not self.is_unfinished() or self.busy or time.monotonic() < self._paused_until:
             return False
-        return self.resting or self._planes_changed or self._draft_key != (self.eye, self.size)
+        return self.resting or self.planes_changed or self._draft_key != (self.eye, self.size)
 
     def is_unfinished(self) -> bool:
         """Returns whether it will want a picture without a further message."""
-        return bool(self.size[0]) and (self._planes_changed or not self._finished)
+        return bool(self.size[0]) and (self.planes_changed or not self._finished)
 
     def pause(self) -> None:
         """Draws nothing for a second, after a picture failed."""
@@ -165,7 +161,7 @@ class Client:
         """
         self._planes, self._scene_time = planes if state.slices is not None else None, scene.time
         is_draft = self._draft_key != (self.eye, self.size)
-        if not is_draft and self._planes_changed and self._last_shown is not None:
+        if not is_draft and self.planes_changed and self._last_shown is not None:
             picture, elapsed_ms, final = self._last_shown
             self._send_picture(picture, state, _FINAL_QUALITY, elapsed_ms, final)
             return None
@@ -273,7 +269,7 @@ class Client:
         self, shown: Picture, state: ViewState, quality: int, elapsed_ms: float, final: bool
     ) -> None:
         """Sends a developed picture, with planes beside it if there are any."""
-        self._last_shown, self._planes_changed = (shown, elapsed_ms, final), False
+        self._last_shown, self.planes_changed = (shown, elapsed_ms, final), False
         self._picture_number += 1
         self._last_sent_time = time.monotonic()
         missed, layout = shown.missed, None

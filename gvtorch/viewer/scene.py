@@ -383,13 +383,11 @@ def _open_data(what: Any) -> Volume | Store:
         raise ValueError(f"view: takes {accepted}: {error}") from None
 
 
-def node_boxes(
-    tree: N3Tree, eye: tuple[float, float, float], limit: int = _MAX_BOXES
-) -> dict[str, Any]:
+def node_boxes(tree: N3Tree, eye: tuple[float, float, float]) -> dict[str, Any]:
     """Returns the nodes whose bricks the last frame read, those nearest to an eye first.
 
     Returns:
-        boxes: At most `limit` [x, y, z, depth], see `N3Tree.loc`.
+        boxes: At most _MAX_BOXES [x, y, z, depth], see `N3Tree.loc`.
         count: Number of all these nodes.
         low, size: World corner and sides of the root.
         branching: N.
@@ -404,7 +402,7 @@ def node_boxes(
     fraction = float(tree.branching) ** -loc[:, 3:].to(torch.float64)
     centre = low + (loc[:, :3] + 0.5) * fraction * size  # (k, 3) world
     distance = (centre - torch.tensor(eye, dtype=torch.float64).to(centre)).norm(dim=1)
-    nearest = distance.argsort(stable=True)[:limit]
+    nearest = distance.argsort(stable=True)[:_MAX_BOXES]
     return {
         "boxes": loc[nearest].tolist(),
         "count": len(loc),
