@@ -5,7 +5,9 @@ from __future__ import annotations
 import inspect
 import re
 import runpy
+from collections.abc import Iterator
 from operator import attrgetter
+from typing import Any, get_args, get_type_hints
 
 import pytest
 from helpers import ROOT
@@ -52,6 +54,15 @@ def test_links_from_other_programs_lead_somewhere():
             target = getattr(target, part)
 
 
+def parameters(function: Any) -> Iterator[str]:
+    """Yields the names of a function's parameters, and those of a TypedDict that it unpacks."""
+    for parameter in inspect.signature(function).parameters.values():
+        yield parameter.name
+        if parameter.kind is parameter.VAR_KEYWORD:
+            for settings in get_args(get_type_hints(function)[parameter.name]):
+                yield from get_type_hints(settings)
+
+
 def test_arguments_in_the_docs_are_those_of_the_code():
     """In calls without further calls in them, such as `gv.Lit(transfer, ambient=0.5)`."""
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
@@ -64,8 +75,7 @@ def test_arguments_in_the_docs_are_those_of_the_code():
     assert len(calls) > 100
     for page, name, argument in calls:
         target = attrgetter(name)(gv)
-        is_class = isinstance(target, type)
-        known = arguments(target) if is_class else inspect.signature(target).parameters
+        known = {*arguments(target)} if isinstance(target, type) else set(parameters(target))
         assert argument in known, f"{page}: {name} takes no {argument}"
 
 
