@@ -70,7 +70,9 @@ def test_backgrounds_tone_and_samples(small, tmp_path):
     run(
         *(small, "-o", tmp_path / "a.png", "--bits", "16", "--background", tmp_path / "sky.npy"),
         *("--samples", "5", "--cone-scale", "0.6", "--tone", "aces", "--exposure", "0.5"),
+        *("--stats", tmp_path / "a.json"),
     )
+    assert '"rays": 1920' in (tmp_path / "a.json").read_text(), "of all five samples"
     render = partial(picture, small, background=sky, cone_scale=0.6)
     expected = gv.Progressive(render).refine(camera, 5).tone_map("aces", exposure=0.5)
     torch.testing.assert_close(gv.read_image(tmp_path / "a.png"), expected.color, atol=1e-4, rtol=0)

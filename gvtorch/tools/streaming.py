@@ -131,7 +131,8 @@ def cost_summary(stats: RenderStats) -> str:
     if not isinstance(stats, FrameStats):
         return text
     bricks = f"{stats.bricks_used} bricks of {stats.bricks}"
-    return f"{text}, {stats.frames} frames, {bricks}{_shortfall(stats)}"
+    frames = f"{stats.frames} frame{'s' * (stats.frames > 1)}"
+    return f"{text}, {frames}, {bricks}{_shortfall(stats)}"
 
 
 def _shortfall(stats: FrameStats) -> str:

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
+from ..base.records import RenderStats
 from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
@@ -151,10 +152,21 @@ class Development:
         return picture.tone_map(self.tone, exposure=self.exposure)
 
     def take(self, render: Callable[[Camera], Picture], camera: Camera) -> Picture:
-        """Renders the picture of a camera at rest: the mean of all samples, developed."""
+        """Renders the picture of a camera at rest: the mean of all samples, developed. Its
+        statistics have the times, rays and samples of all of them.
+        """
         if self.samples == 1:
             return self.develop(render(camera))
-        return self.develop(Progressive(render).refine(camera, self.samples))
+        stats: list[RenderStats] = []
+
+        def counted(view: Camera) -> Picture:
+            picture = render(view)
+            stats.append(picture.stats)
+            return picture
+
+        mean = Progressive(counted).refine(camera, self.samples)
+        total = reduce(lambda before, now: now.after(before), stats)
+        return self.develop(replace(mean, stats=total))
 
 
 @dataclass(frozen=True, kw_only=True)
