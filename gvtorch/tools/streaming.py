@@ -127,7 +127,8 @@ def cost_summary(stats: RenderStats) -> str:
     """Returns what a picture cost, in a few words."""
     from ..engine import FrameStats
 
-    text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
+    samples = f"{stats.samples / 1e6:.1f} M" if stats.samples >= 1e5 else f"{stats.samples:,}"
+    text = f"{samples} samples in {stats.milliseconds:.0f} ms ({stats.backend})"
     if not isinstance(stats, FrameStats):
         return text
     bricks = f"{stats.bricks_used} bricks of {stats.bricks}"
