@@ -47,8 +47,9 @@ demo: $(VENV)/ready
 	  --camera look:-260,-340,190,63.5,63.5,127.5 --up 0,0,1 --background 0.02,0.02,0.03 -o out/demo.png
 	@echo "The picture: $(CURDIR)/out/demo.png"
 
+# Without the film, and without the stars, which are those of a catalogue there.
 gallery: $(VENV)/ready
-	for name in $(filter-out mandelbulb_film,$(basename $(notdir $(wildcard examples/*.py)))); do \
+	for name in $(filter-out mandelbulb_film stars,$(basename $(notdir $(wildcard examples/*.py)))); do \
 	  $(BIN)/python examples/$$name.py --output docs/images/$$name.png || exit; \
 	done
 

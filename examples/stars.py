@@ -32,8 +32,8 @@ class Settings:
 def made_up_stars(count: int = 60_000) -> tuple[gv.Points, np.ndarray]:
     """Returns stars out to where each is visible, the brighter the farther, and their B-V."""
     random = np.random.default_rng(4)
-    luminosity = 0.5 * random.random(count) ** -0.9
-    distance = np.minimum(90 * np.sqrt(luminosity), 900) * random.random(count) ** 0.5
+    luminosity = 16 * random.random(count) ** -0.9
+    distance = np.minimum(40 * np.sqrt(luminosity), 900) * random.random(count) ** 0.5
     directions = random.standard_normal((count, 3)) * (1, 0.7, 0.4)
     positions = directions * (distance / np.linalg.norm(directions, axis=1))[:, None]
     return gv.Points(positions, luminosity), random.normal(0.6, 0.4, count)

@@ -95,6 +95,15 @@ def test_what_cant_run_here_is_left_out_of_all(monkeypatch, capsys):
         Bench(name="opengl").run()
 
 
+def test_all_workloads_without_a_case_are_a_mistake(monkeypatch):
+    def run_workload(self, name):
+        raise bench.Unavailable(f"no case of {name} has {self.only!r} in its name")
+
+    monkeypatch.setattr(Bench, "_run_workload", run_workload)
+    with pytest.raises(ValueError, match="bench: all workloads were left out"):
+        Bench(name="all", only="nothing").run()
+
+
 def test_twins_and_streamed_shaders_draw_the_same(compiled, monkeypatch, quick):
     monkeypatch.setenv("CXX", quick)
     chosen = Settings(device=torch.device(DEVICES[compiled]), only="aneurism", **QUICK)
@@ -146,6 +155,12 @@ def test_a_peer_renders_the_same_picture(name, bound):
     row = record.rows[-1]
     assert row["who"] == name and row["rms_difference"] < bound
     assert any(note.startswith(f"{name}: ") for note in record.notes)
+
+
+def test_workloads_and_their_peers_are_known():
+    assert {*bench.COMPARED_WITH} <= {*bench.WORKLOADS} >= {*bench.SAVES_PICTURES}
+    compared = {name for peers in bench.COMPARED_WITH.values() for name in peers}
+    assert compared == {*record_module.PEERS}
 
 
 @pytest.mark.backend("cpp")
@@ -207,7 +222,9 @@ def test_the_command_lists_and_names_mistakes():
     assert json.loads(gvtorch("bench", "--json").stdout) == bench.WORKLOADS
     for args, message in (
         (["nonsense"], "unknown workload 'nonsense'; known: march"),
-        (["lru", "--peers", "nobody"], "unknown peer 'nobody'; known: grid_sample"),
+        (["lru", "--peers", "vtk"], "--peers: lru is compared with nothing, not 'vtk'"),
+        (["all", "--peers", "nobody"], "all is compared with grid_sample, warp, drjit, vtk, viser"),
+        (["lru", "--pictures", "folder"], "--pictures is for march and first_hit"),
         (["lru", "--device", "teapot"], "--device must be cpu, cuda or cuda:N"),
         (["lru", "--quick", "--only", "nothing"], "no case of lru has 'nothing' in its name"),
         (["lru", "--repeats", "0"], "repeats must be an int >= 1"),

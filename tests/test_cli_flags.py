@@ -190,6 +190,10 @@ OWN_KEYS = '[{"eye": [1, 2, 3], "target": [0, 0, 0], "up": [0, 1, 0], "fov": 20}
             ),
             "--stop-alpha is for what adds up",
         ),
+        (
+            lambda t: ["render", "S", "-o", t / "a.png", "--lod", "finest", "--cone-scale", "2"],
+            "--cone-scale is for --lod auto, or for the cones of --lighting",
+        ),
         (lambda t: ["render", "S", "-o", t / "a.png", "--value", "9"], "--value and --shader iso"),
         (lambda t: ["render", "S", "-o", t / "a.png", "--window", "5,1"], "LO,HI with LO < HI"),
         (lambda t: ["info", "--shape", "1,2,3"], "--shape is for volume files: name one"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 
 import numpy as np
@@ -23,9 +24,10 @@ def picture(path, camera, **options) -> gv.Picture:
     return gv.render(gv.N3Tree.from_volume(volume), camera, shader, **options)
 
 
-def run(*args: object) -> None:
+def run(*args: object) -> str:
     done = gvtorch("render", *args, *LOOK)
     assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 @pytest.mark.backend("cpp")
@@ -70,7 +72,9 @@ def test_backgrounds_tone_and_samples(small, tmp_path):
     run(
         *(small, "-o", tmp_path / "a.png", "--bits", "16", "--background", tmp_path / "sky.npy"),
         *("--samples", "5", "--cone-scale", "0.6", "--tone", "aces", "--exposure", "0.5"),
+        *("--stats", tmp_path / "a.json"),
     )
+    assert '"rays": 1920' in (tmp_path / "a.json").read_text(), "of all five samples"
     render = partial(picture, small, background=sky, cone_scale=0.6)
     expected = gv.Progressive(render).refine(camera, 5).tone_map("aces", exposure=0.5)
     torch.testing.assert_close(gv.read_image(tmp_path / "a.png"), expected.color, atol=1e-4, rtol=0)
@@ -81,11 +85,12 @@ def test_backgrounds_tone_and_samples(small, tmp_path):
     ("name", "bits"), [("a.tif", "8"), ("a.tif", "32"), ("a.exr", "16"), ("a.png", "8")]
 )
 def test_files_of_every_kind(small, tmp_path, name, bits):
-    run(small, "-o", tmp_path / name, "--bits", bits, "--stats", tmp_path / "a.json")
+    told = run(small, "-o", tmp_path / name, "--bits", bits, "--stats", tmp_path / "a.json")
     expected = picture(small, gv.Camera.orbit(20, 10, 0.8, None, 24, 16))
     actual = gv.read_image(tmp_path / name)[..., :3]
     torch.testing.assert_close(actual, expected.color, atol=0.01, rtol=0)
-    assert '"rays": 384' in (tmp_path / "a.json").read_text()
+    stats = json.loads((tmp_path / "a.json").read_text())
+    assert stats["rays"] == 384 and f"{stats['samples']:,} samples in" in told
 
 
 @pytest.mark.parametrize(

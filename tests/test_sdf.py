@@ -166,6 +166,27 @@ def test_nothing_lies_beyond_a_box(shape):
         assert inside.any() and ((points >= low) & (points <= high)).all(1)[inside].all()
 
 
+@pytest.mark.parametrize("iterations", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **few: gv.Mandelbulb(8, **few),
+        lambda **few: gv.Mandelbulb(2, bailout=4.0, **few),
+        lambda **few: gv.Mandelbulb(3, bailout=1.2, **few),
+        lambda **few: gv.Julia((-0.2, 0.5, 0.3), 2, **few),
+        lambda **few: gv.Julia((0.0, 0.0, 0.0), 5, **few),
+        lambda **few: gv.Mandelbox(2.0, **few),
+        lambda **few: gv.Mandelbox(-1.5, **few),
+    ],
+)
+def test_the_box_of_a_fractal_holds_what_has_not_escaped_after_few_steps(make, iterations):
+    shape = make(iterations=iterations)
+    low, high = shape.box()
+    points = random_points(300_000, float(2.4 * high.max()))
+    inside = points[shape(points) < 0]
+    assert len(inside) > 20 and ((inside >= low) & (inside <= high)).all()
+
+
 def test_shapes_have_the_colour_of_what_is_nearer():
     union, points = ball() | block(), random_points(2000)
     value, color = union.surface(points)

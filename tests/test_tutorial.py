@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import runpy
+from collections.abc import Iterator
+from operator import attrgetter
+from typing import Any, get_args, get_type_hints
 
 import pytest
 from helpers import ROOT
 
 import gvtorch as gv
+from gvtorch.viewer.schema import arguments
 
 FOLDER = ROOT / "docs" / "tutorial"
 PAGES = sorted(FOLDER.glob("*.md"))
@@ -47,6 +52,31 @@ def test_links_from_other_programs_lead_somewhere():
         target: object = gv
         for part in name.split("."):
             target = getattr(target, part)
+
+
+def parameters(function: Any) -> Iterator[str]:
+    """Yields the names of a function's parameters, and those of a TypedDict that it unpacks."""
+    for parameter in inspect.signature(function).parameters.values():
+        yield parameter.name
+        if parameter.kind is parameter.VAR_KEYWORD:
+            for settings in get_args(get_type_hints(function)[parameter.name]):
+                yield from get_type_hints(settings)
+
+
+def test_arguments_in_the_docs_are_those_of_the_code():
+    """In calls without further calls in them, such as `gv.Lit(transfer, ambient=0.5)`."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    calls = [
+        (page.name, name, argument)
+        for page in pages
+        for name, inner in re.findall(r"\bgv\.([\w.]+)\(([^()]*)\)", page.read_text())
+        for argument in re.findall(r"\b(\w+)=", inner)
+    ]
+    assert len(calls) > 100
+    for page, name, argument in calls:
+        target = attrgetter(name)(gv)
+        known = {*arguments(target)} if isinstance(target, type) else set(parameters(target))
+        assert argument in known, f"{page}: {name} takes no {argument}"
 
 
 def test_the_gallery_has_every_example_and_its_picture():

@@ -14,9 +14,11 @@ from helpers.pictures import GRAY
 from helpers.viewer import FUNCTION, Page, bright_ball, pixels, turned_camera
 
 import gvtorch as gv
+from gvtorch.base.stage import no_progress
 from gvtorch.io.surface import export_surface
 from gvtorch.viewer import export
 from gvtorch.viewer.client import image_file
+from gvtorch.viewer.scene import Scene
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
@@ -440,6 +442,39 @@ def test_others_go_on_while_a_still_is_taken_and_it_ends_with_its_page(session):
     begin = time.monotonic()
     session.close()
     assert time.monotonic() - begin < 10 and not session._thread.is_alive()
+
+
+def test_a_draft_that_takes_long_gives_way_to_a_newer_view(session, monkeypatch):
+    """The next has fewer pixels; a page that leaves, and a view that closes, end it at once."""
+    page = Page(session, 512, 512)
+    page.final()
+    frame, sizes, ended = Scene.frame, [], []
+
+    def slow(scene, camera, state, progress=no_progress):
+        sizes.append(camera.width)
+        try:
+            for row in range(1, 500):
+                time.sleep(0.005 if camera.width > 200 else 0)
+                progress("rays", row, 500)
+        except BaseException:
+            ended.append(camera.width)
+            raise
+        return frame(scene, camera, state, progress)
+
+    monkeypatch.setattr(Scene, "frame", slow)
+    session.ask(lambda: setattr(page.client, "_pixel_ms", 1e-9))
+    for angle in (0.1, 0.2):
+        page.send("move", camera=turned_camera(page.camera, angle), moving=True)
+        page.until(lambda: sizes)
+    page.until(lambda: len(sizes) > 1)
+    assert ended[0] == sizes[0] == 512 > sizes[1]
+    for end in (session.leave, lambda _: session.close()):
+        sizes.clear()
+        page = Page(session, 512, 512)
+        page.until(lambda: sizes)
+        ended.clear()
+        end(page.client)
+        page.until(lambda: ended, timeout=2.0)
 
 
 def test_whole_states_with_what_json_can_not_tell_are_taken():

@@ -17,6 +17,7 @@ from helpers.viewer import FUNCTION, TIMEOUT, Grown, Page, bright_ball, pixels, 
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
+from gvtorch.viewer import scene
 from gvtorch.viewer.scene import node_boxes
 from gvtorch.viewer.slices import Planes, panes
 from gvtorch.viewer.state import Development, Eye, Slices
@@ -360,7 +361,7 @@ def test_a_clock_of_a_producer_is_set():
 # Node boxes.
 
 
-def test_node_boxes_are_the_nodes_whose_bricks_were_read():
+def test_node_boxes_are_the_nodes_whose_bricks_were_read(monkeypatch):
     tree = gv.N3Tree.from_volume(gv.Volume(noise((20, 24, 28, 1)), spacing=(1.0, 2.0, 1.5)))
     camera = gv.Camera.orbit(30, 20, width=64, height=48)
     gv.render(tree, camera, GRAY)
@@ -380,7 +381,8 @@ def test_node_boxes_are_the_nodes_whose_bricks_were_read():
         for loc in answer["boxes"]
     ]
     assert far == sorted(far)
-    few = node_boxes(tree, eye, 5)
+    monkeypatch.setattr(scene, "_MAX_BOXES", 5)
+    few = node_boxes(tree, eye)
     assert few["boxes"] == answer["boxes"][:5] and few["count"] == answer["count"]
     x, y, z, depth = answer["boxes"][0]
     share = 2.0**-depth

@@ -40,6 +40,7 @@ GOOD: dict[str, dict[str, Any]] = {
     "change": {"state": {"options": {"step": 0.5}}, "rest": True},
     "pick": {"x": 0.5, "y": 0.5, "purpose": "focus"},
     "histogram": {"in_view": True},
+    "find": {"text": "17"},
     "preset": {"name": "gray", "low": 0, "high": 1},
     "read": {"file": "a.json", "text": "{}", "name": None, "low": 0, "high": 1},
     "export": {"name": "mine"},

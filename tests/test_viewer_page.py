@@ -500,18 +500,31 @@ def test_a_handle_moves_the_first_of_several_boxes(chromium):
         tab.close()
 
 
-def test_of_more_labels_than_have_a_row_none_is_hidden_by_another(chromium):
-    """A list of those that are shown could name only those with a row."""
+def test_of_more_labels_than_a_page_has_all_are_found_and_none_is_hidden_by_another(chromium):
+    """A list of those that are shown could name only those that the page has."""
     names = np.arange(17**3, dtype=np.uint16).reshape(17, 17, 17)
     with gv.view(gv.Volume(names, labels=True), browser=False, wait=False) as viewer:
         tab = Tab(chromium, viewer.url)
         tab.until("app?.state")
-        assert tab.page.get_by_text("817 labels above 4095 have no row").is_visible()
+        assert tab.page.get_by_text("4853 more: find them by number").is_visible()
         row = tab.page.locator(".gv-label:has-text('17')").first
         assert row.locator("input[type=checkbox]").is_disabled()
         row.get_by_text("only").click()
         tab.until(lambda: viewer.state.shader.visible == [17])
-        assert row.locator("input[type=checkbox]").is_enabled() and not tab.complaints
+        assert row.locator("input[type=checkbox]").is_enabled()
+        search = tab.page.locator("input[placeholder='find a label']")
+        for text, label in (("4912", 4912), ("490", 4905)):
+            search.fill(text)
+            row = tab.page.locator(f".gv-label:has-text('{label}')")
+            row.wait_for()
+            row.locator("input[type=checkbox]").check()
+        tab.until(lambda: viewer.state.shader.visible == [17, 4905, 4912])
+        row.locator("input[type=checkbox]").uncheck()
+        tab.until(lambda: viewer.state.shader.visible == [17, 4912])
+        assert tab.page.locator(".gv-label").count() == 15  # 490 to 4490, 4900 to 4909
+        search.fill("")
+        tab.page.get_by_text("4853 more: find them by number").wait_for()
+        assert not tab.complaints
         tab.close()
 
 

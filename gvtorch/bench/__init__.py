@@ -32,6 +32,14 @@ WORKLOADS = {
     "voxelize": "a mesh of 100,000 triangles to voxels and to a store; also by other libraries",
     "blocks": "random blocks with borders read from a store, compared with tensorstore and zarr",
 }
+_RENDERERS = ("grid_sample", "warp", "drjit", "vtk")
+#: What workloads are compared with, by the names in `--peers`; the others have no peers.
+COMPARED_WITH = {
+    **{"march": _RENDERERS, "first_hit": _RENDERERS, "view": ("viser", "trame")},
+    "noise": ("pyfastnoiselite", "pyfastnoisesimd"),
+    **{"voxelize": ("trimesh", "igl"), "blocks": ("tensorstore", "zarr")},
+}
+SAVES_PICTURES = ("march", "first_hit")
 _MODULES = {
     **dict.fromkeys(("march", "first_hit", "calls", "bricks"), "march"),
     **{"frame": "frames", "deep": "frames"},
@@ -50,18 +58,13 @@ def run(name: str, settings: Settings) -> Record:
     """Runs a workload.
 
     Raises:
-        ValueError: There is no such workload or peer.
+        ValueError: There is no such workload.
         Unavailable: The workload can't run here, or no case has `only` in its name.
     """
-    from .record import PEERS, Record, noting_other_processes
+    from .record import Record, noting_other_processes
 
-    for noun, requested, known in (
-        ("workload", (name,), WORKLOADS),
-        ("peer", settings.peers or (), PEERS),
-    ):
-        unknown = sorted(set(requested) - set(known))
-        if unknown:
-            raise ValueError(f"bench: unknown {noun} {unknown[0]!r}; known: {', '.join(known)}")
+    if name not in WORKLOADS:
+        raise ValueError(f"bench: unknown workload {name!r}; known: {', '.join(WORKLOADS)}")
     record = Record(name, settings)
     with noting_other_processes(record):
         getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)(record)

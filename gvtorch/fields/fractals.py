@@ -211,6 +211,15 @@ class Fractal(Distance):
         ends = self.colors_33.to(center)
         return ends.amin(0).expand_as(center), ends.amax(0).expand_as(center)
 
+    def _escape_radius(self, radius: float, growth: float, gain: float = 0.0) -> float:
+        """Returns the radius beyond which all orbits escape within `iterations`, given one beyond
+        which they escape at last: each step multiplies an orbit's distance beyond that by at least
+        `growth`, and adds at least `gain`. What float32 can't resolve is left out.
+        """
+        first_step = max(0.0, float(self.bailout) - radius) * growth ** (1 - self.iterations)
+        excess = (first_step - gain) / growth
+        return radius + excess if excess > radius * torch.finfo(torch.float32).eps else radius
+
     def _cube(self, half_side: float) -> Tensor:
         """Returns the box (2, 3) of a cube around the origin."""
         ends = torch.tensor(
@@ -227,10 +236,13 @@ class Mandelbulb(Fractal):
         super().__init__(Power(power), **settings)
 
     def box(self) -> Tensor:
-        """Returns a cube of half side 2^(1 / (n - 1)); beyond it |z|^n outgrows |c|: all escape."""
+        """Returns a cube of half side R = 2^(1 / (n - 1)), a little enlarged for orbits that have
+        not escaped after `iterations`: from |z| = R + d, at most as far out as c is, |z^n + c| is
+        at least |z|^n - |c| >= R^n + n R^(n-1) d - |c| >= R + (2 n - 1) d.
+        """
         power = self.iteration.power
         assert isinstance(power, int)
-        return self._cube(2.0 ** (1 / (power - 1)))
+        return self._cube(self._escape_radius(2.0 ** (1 / (power - 1)), 2 * power - 1))
 
 
 class Julia(Fractal):
@@ -247,14 +259,20 @@ class Julia(Fractal):
         check.number("Julia", "length of the constant", self.constant.norm(), high=1e20)
 
     def box(self) -> Tensor:
-        """Returns a cube of half side R >= 1 with R^n - |c| > R: all points beyond R escape."""
+        """Returns a cube of half side R >= 1 with R^n - |c| > R: all points beyond R escape. It is
+        a little enlarged for those that have not escaped after `iterations`: from |z| = R + d,
+        |z^n + c| is at least R^n + n R^(n-1) d - |c|.
+        """
         power = self.iteration.power
         assert isinstance(power, int)
         constant_norm = float(self.constant.norm())
         radius = max(1.0, math.floor(constant_norm ** (1 / power)))  # not yet large enough
         while radius**power - constant_norm <= radius:
             radius += 1 / 64
-        return self._cube(radius)
+        growth = power * radius ** (power - 1)
+        return self._cube(
+            self._escape_radius(radius, growth, gain=radius**power - constant_norm - radius)
+        )
 
 
 class Mandelbox(Fractal):

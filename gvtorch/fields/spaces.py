@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from .distance import Changed, Distance, Intersection, grown
+from .distance import Changed, Difference, Distance, Intersection, grown
 from .field import Interval, box_distance, length, tighter, unit_vector
 
 Matrix = Sequence[Sequence[float]]
@@ -67,11 +67,10 @@ class Space(Changed):
 
     @property
     def _has_far_values(self) -> bool:
-        """Whether the shape's value is at least the distance from its box. Beyond a corner of the
-        box, the larger of two distances is less.
+        """Whether the shape's value is at least the distance from its box. Beyond a corner of an
+        intersection's box, the larger of two distances is less; a difference has the first's box.
         """
-        cut = any(type(part) is Intersection for part in self.shape.modules())
-        return self.shape.exact and not cut
+        return self.shape.exact and all(isinstance(cut, Difference) for cut in _cuts(self.shape))
 
     def level_box(self, level: Tensor | float) -> Tensor | None:
         box = None if self._has_far_values else self.shape.level_box(level)
@@ -206,8 +205,8 @@ class Repeat(Space):
                 and check.integer(context, "count", axis_count, low=1) % 2 == 0
             ):
                 raise ValueError(f"{context}: count must be odd, got {counts}")
-        cut = any(isinstance(part, Intersection) for part in shape.modules())
-        self._jumps = cut or not shape.exact  # whether values are no distances, see `slope`
+        # Whether values are no distances, see `slope`.
+        self._jumps = not shape.exact or bool(_cuts(shape))
         self._max_cell = [
             math.inf if axis_count is None else (axis_count - 1) // 2 for axis_count in counts
         ]
@@ -380,6 +379,11 @@ class Revolution(Space):
         return torch.stack(
             (torch.stack((-radius, -radius, box[0, 1])), torch.stack((radius, radius, box[1, 1])))
         )
+
+
+def _cuts(shape: Distance) -> list[Intersection]:
+    """Returns the intersections and differences in a shape."""
+    return [part for part in shape.modules() if isinstance(part, Intersection)]
 
 
 def moved(shape: Distance, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Transform:

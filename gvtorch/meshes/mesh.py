@@ -85,10 +85,10 @@ class Mesh:
                 raise ValueError(
                     f"{self.name}: {field_name} must be ({expected_shape}), got {value.shape}"
                 )
-            object.__setattr__(self, field_name, value)
+            vars(self)[field_name] = value
             count = len(self.faces)
         if self.material is None:
-            object.__setattr__(self, "material", np.zeros(count, np.int64))
+            vars(self)["material"] = np.zeros(count, np.int64)
         self._check()
 
     def _check(self) -> None:

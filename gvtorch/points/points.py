@@ -42,8 +42,7 @@ class Points:
             raise ValueError(
                 f"Points: values must be ({count},) or ({count}, c), got {value.shape}"
             )
-        object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "values", value)
+        vars(self).update(positions=positions, values=value)
         for name, shape in (("colors", (count, 3)), ("radius", (count,))):
             if (attribute := getattr(self, name)) is None:
                 continue
@@ -53,7 +52,7 @@ class Points:
                 raise ValueError(f"Points: {name} must be {shape}, got {array.shape}")
             if bool((array < 0).any()):
                 raise ValueError(f"Points: {name} must be at least 0, got {array.min():g}")
-            object.__setattr__(self, name, array)
+            vars(self)[name] = array
 
     def __len__(self) -> int:
         return len(self.positions)

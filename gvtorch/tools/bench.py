@@ -39,7 +39,7 @@ class Bench:
     pictures: Annotated[Path | None, option(metavar="FOLDER")] = None
 
     def run(self) -> None:
-        from ..bench import WORKLOADS, Unavailable
+        from ..bench import COMPARED_WITH, SAVES_PICTURES, WORKLOADS, Unavailable
 
         if self.name is None:
             listing = [f"{name:10} {description}" for name, description in WORKLOADS.items()]
@@ -49,6 +49,16 @@ class Bench:
         if names[0] not in WORKLOADS:
             known_names = ", ".join((*WORKLOADS, "all"))
             raise ValueError(f"bench: unknown workload {self.name!r}; known: {known_names}")
+        known_peers = [peer for name in names for peer in COMPARED_WITH.get(name, ())]
+        for peer in self._peers() or ():
+            if peer not in known_peers:
+                known_text = ", ".join(dict.fromkeys(known_peers)) or "nothing"
+                raise ValueError(
+                    f"--peers: {self.name} is compared with {known_text}, not {peer!r}"
+                )
+        if self.pictures is not None and not {*names} & {*SAVES_PICTURES}:
+            raise ValueError(f"--pictures is for {' and '.join(SAVES_PICTURES)}")
+        left_out = 0
         for name in names:
             try:
                 self._run_workload(name)
@@ -56,6 +66,14 @@ class Bench:
                 if self.name != "all":
                     raise
                 print(f"{name} is left out: {reason}", file=sys.stderr)
+                left_out += 1
+        if left_out == len(names):
+            raise ValueError("bench: all workloads were left out")
+
+    def _peers(self) -> tuple[str, ...] | None:
+        """Returns the peers of `--peers`; None: all that are installed."""
+        peers = None if self.peers is None else tuple(p for p in self.peers.split(",") if p)
+        return () if peers == ("none",) else peers
 
     def _run_workload(self, name: str) -> None:
         import torch
@@ -69,7 +87,6 @@ class Bench:
             device = torch.device(self.device)
         except RuntimeError:
             raise ValueError(f"--device must be cpu, cuda or cuda:N, got {self.device!r}") from None
-        peers = None if self.peers is None else tuple(p for p in self.peers.split(",") if p)
         error_console = Console(stderr=True)
         with error_console.status(name) as status:
             settings = Settings(
@@ -77,7 +94,7 @@ class Bench:
                 quick=self.quick,
                 repeats=self.repeats,
                 seconds=self.seconds,
-                peers=() if peers == ("none",) else peers,
+                peers=self._peers(),
                 only=self.only,
                 pictures=self.pictures,
                 tell=status.update,

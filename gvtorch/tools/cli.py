@@ -183,6 +183,7 @@ def installation() -> dict[str, Any]:
     from ..io.formats import FORMATS
     from ..ops import unavailable
 
+    threads = torch.get_num_threads()
     gpu_indices = range(torch.cuda.device_count()) if torch.cuda.is_available() else ()
     return {
         "gvtorch": __version__,
@@ -190,7 +191,7 @@ def installation() -> dict[str, Any]:
         "torch": torch.__version__,
         "backends": {name: reason or "ready" for name, reason in unavailable().items()},
         "devices": [
-            f"cpu ({torch.get_num_threads()} threads)",
+            f"cpu ({threads} thread{'s' * (threads > 1)})",
             *(f"cuda:{i} ({torch.cuda.get_device_name(i)})" for i in gpu_indices),
         ],
         "formats": {file_format.name: file_format.status for file_format in FORMATS},
@@ -198,13 +199,13 @@ def installation() -> dict[str, Any]:
 
 
 def _readable(content: dict[str, Any]) -> dict[str, Any]:
-    """Returns names with blanks for underscores, and bytes in readable units."""
+    """Returns names with blanks for underscores, bytes in readable units, and rounded seconds."""
     from ..io.resources import amount
 
     out = {}
     for name, value in content.items():
         is_bytes = name.endswith(("_bytes", "_free"))
-        text = amount(value) if is_bytes else value
+        text = amount(value) if is_bytes else f"{value:.1f}" if name == "seconds" else value
         out[name.removesuffix("_bytes").replace("_", " ")] = text
     return out
 
@@ -216,6 +217,8 @@ def _print_table(content: dict[str, Any]) -> None:
 
     table = Table(show_header=False, box=None)
     for name, value in content.items():
+        if value is None:
+            continue
         if name == "histogram":
             text = _sparkline(value)
         elif isinstance(value, dict):

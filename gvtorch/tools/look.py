@@ -128,6 +128,8 @@ class Look:
         """Returns fields of `RenderOptions`."""
         if self.stop_alpha != Look().stop_alpha and not self._accumulates():
             raise ValueError(f"--stop-alpha is for what adds up along a ray, not for {self.shader}")
+        if self.cone_scale is not None and self.lod == "finest" and self.lighting is None:
+            raise ValueError("--cone-scale is for --lod auto, or for the cones of --lighting")
         names = ("step", "lod", "stop_alpha", "component", "backend")
         return {
             **{name: getattr(self, name) for name in names},

@@ -127,11 +127,13 @@ def cost_summary(stats: RenderStats) -> str:
     """Returns what a picture cost, in a few words."""
     from ..engine import FrameStats
 
-    text = f"{stats.samples / 1e6:.1f} M samples in {stats.milliseconds:.0f} ms ({stats.backend})"
+    samples = f"{stats.samples / 1e6:.1f} M" if stats.samples >= 1e5 else f"{stats.samples:,}"
+    text = f"{samples} samples in {stats.milliseconds:.0f} ms ({stats.backend})"
     if not isinstance(stats, FrameStats):
         return text
     bricks = f"{stats.bricks_used} bricks of {stats.bricks}"
-    return f"{text}, {stats.frames} frames, {bricks}{_shortfall(stats)}"
+    frames = f"{stats.frames} frame{'s' * (stats.frames > 1)}"
+    return f"{text}, {frames}, {bricks}{_shortfall(stats)}"
 
 
 def _shortfall(stats: FrameStats) -> str:

@@ -25,6 +25,7 @@ _SHOW_SECONDS = 0.3  # seconds between pictures of a camera at rest
 _DRAFT_QUALITY, _FINAL_QUALITY = 80, 94  # JPEG quality
 _CHEAP_PIXELS = 200_000  # pixels up to which the final quality costs little
 _MIN_DRAFT_SCALE = 0.1  # least fraction of the width and height, of a draft
+_LATE_DRAFT_MS = 250.0  # milliseconds after which a draft is given up for something newer
 _UNCHANGED_FRAMES = 3  # frames without new data, after which a picture counts as finished
 
 
@@ -47,7 +48,8 @@ class Client:
         picture: Its last picture, or None.
         monitor: Whether it receives figures of the frames.
         nodes: Whether it receives boxes of the nodes of each frame.
-        gone: Whether it has left.
+        planes_changed: Whether planes beside its picture have changed, but not the picture.
+        gone: Whether it has left, or the view is closed: ends work for it.
     """
 
     def __init__(self, number: int, send: Send, eye: Eye) -> None:
@@ -55,7 +57,7 @@ class Client:
         self.number, self._send = number, send
         self.eye, self.size, self.rate = eye, (0, 0), 25.0
         self.follows: int | None = None
-        self.monitor = self.nodes = self.gone = False
+        self.monitor = self.nodes = self.gone = self.planes_changed = False
         self._moving, self._move_time, self._move_clock = False, 0.0, 0.0
         self._draft_key: tuple[Any, ...] | None = None  # (eye, size) of the last draft
         self._progressive: Progressive | None = None
@@ -63,7 +65,6 @@ class Client:
         self._last_sent_time = self._paused_until = 0.0
         # Developed picture, milliseconds that it took, and whether it is final.
         self._last_shown: tuple[Picture, float, bool] | None = None
-        self._planes_changed = False  # whether planes beside it have changed
         self._pixel_ms, self._fixed_ms = 5e-4, 0.0  # cost of a pixel; of a frame in addition
         self.picture: Picture | None = None
         self._camera: Camera | None = None
@@ -118,10 +119,6 @@ class Client:
         self.eye, self._moving, self._finished = eye, moving, False
         self._move_time, self._move_clock = time.monotonic(), sent
 
-    def mark_planes_changed(self) -> None:
-        """Notes that planes beside the picture have changed, but not the picture."""
-        self._planes_changed = True
-
     def restart(self, resting: bool) -> None:
         """Restarts the picture after a change; unless `resting`, as if the camera moved."""
         self._progressive, self._finished, self._draft_key = None, False, None
@@ -145,11 +142,11 @@ class Client:
         """Returns whether a picture is to be drawn now."""
         if not self.is_unfinished() or self.busy or time.monotonic() < self._paused_until:
             return False
-        return self.resting or self._planes_changed or self._draft_key != (self.eye, self.size)
+        return self.resting or self.planes_changed or self._draft_key != (self.eye, self.size)
 
     def is_unfinished(self) -> bool:
         """Returns whether it will want a picture without a further message."""
-        return bool(self.size[0]) and (self._planes_changed or not self._finished)
+        return bool(self.size[0]) and (self.planes_changed or not self._finished)
 
     def pause(self) -> None:
         """Draws nothing for a second, after a picture failed."""
@@ -163,14 +160,14 @@ class Client:
         `is_outdated` returned true, or if only the planes have changed.
         """
         self._planes, self._scene_time = planes if state.slices is not None else None, scene.time
-        if self._draft_key != (self.eye, self.size):
-            return self._draw_draft(scene, state)
-        if self._planes_changed and self._last_shown is not None and self._camera is not None:
+        is_draft = self._draft_key != (self.eye, self.size)
+        if not is_draft and self.planes_changed and self._last_shown is not None:
             picture, elapsed_ms, final = self._last_shown
             self._send_picture(picture, state, _FINAL_QUALITY, elapsed_ms, final)
             return None
         try:
-            return self._draw_refined(scene, state, is_outdated)
+            draw = self._draw_draft if is_draft else self._draw_refined
+            return draw(scene, state, is_outdated)
         except Interrupted:
             return None
 
@@ -178,7 +175,20 @@ class Client:
         """Returns (width, height) of the picture without the planes beside it."""
         return self.size if self._planes is None else panes(*self.size)["view"][2:]
 
-    def _draw_draft(self, scene: Scene, state: ViewState) -> Picture:
+    def _draw_draft(
+        self, scene: Scene, state: ViewState, is_outdated: Callable[[], bool]
+    ) -> Picture:
+        """Draws a picture of as many pixels as fit in the time of a frame. If it takes much longer
+        and something newer is to be shown, it is given up, and the next has fewer pixels.
+        """
+
+        def stop_if_late(_stage: str, done: int, total: int) -> None:
+            late_ms = 1e3 * (time.perf_counter() - start)
+            is_late = late_ms > _LATE_DRAFT_MS and scale > _MIN_DRAFT_SCALE
+            if done < total and (self.gone or (is_late and is_outdated())):
+                self._pixel_ms = late_ms / (done * size[0])
+                raise Interrupted
+
         width, height = self._view_size()
         frame_ms = 1e3 / self.rate
         pixels_ms = max(frame_ms - self._fixed_ms, frame_ms / 2)
@@ -186,7 +196,7 @@ class Client:
         scale = min(1.0, max(_MIN_DRAFT_SCALE, scale))
         size = max(1, round(width * scale)), max(1, round(height * scale))
         camera, start = self.eye.camera(*size, scene.box), time.perf_counter()
-        picture = scene.frame(camera, state)
+        picture = scene.frame(camera, state, stop_if_late)
         elapsed_ms = 1e3 * (time.perf_counter() - start)
         self._update_costs(picture, elapsed_ms, size[0] * size[1])
         self._draft_key, self._progressive = (self.eye, self.size), None
@@ -259,7 +269,7 @@ class Client:
         self, shown: Picture, state: ViewState, quality: int, elapsed_ms: float, final: bool
     ) -> None:
         """Sends a developed picture, with planes beside it if there are any."""
-        self._last_shown, self._planes_changed = (shown, elapsed_ms, final), False
+        self._last_shown, self.planes_changed = (shown, elapsed_ms, final), False
         self._picture_number += 1
         self._last_sent_time = time.monotonic()
         missed, layout = shown.missed, None

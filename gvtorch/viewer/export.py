@@ -22,14 +22,14 @@ _PROGRESS_SECONDS = 0.2  # seconds between two messages of progress
 
 
 class SurfaceExport:
-    """A surface that is being made for a page."""
+    """A surface that is being made for a page; it ends, at the next block, when the page leaves."""
 
     def __init__(
         self, client: Client, request: Surface, data: Volume | Store, component: int
     ) -> None:
         """Starts to make the surface that a page asked for, of one component of the voxels."""
         self._client, self._request, self._data, self._component = client, request, data, component
-        self._cancelled, self._last_progress = False, 0.0
+        self._last_progress = 0.0
         self._thread = threading.Thread(target=self._run, name="gvtorch surface", daemon=True)
         self._thread.start()
 
@@ -37,14 +37,6 @@ class SurfaceExport:
     def busy(self) -> bool:
         """Whether it is still being made."""
         return self._thread.is_alive()
-
-    def serves(self, client: Client) -> bool:
-        """Returns whether it is made for this page."""
-        return client is self._client
-
-    def end(self) -> None:
-        """Stops it at the next block; does not wait for that."""
-        self._cancelled = True
 
     def _run(self) -> None:
         request, client = self._request, self._client
@@ -72,7 +64,7 @@ class SurfaceExport:
             client.send_message("refused", text=one_line(error))
 
     def _progress(self, _stage: str, done: int, total: int) -> None:
-        if self._cancelled:
+        if self._client.gone:
             raise Interrupted
         now = time.monotonic()
         if now > self._last_progress + _PROGRESS_SECONDS and done < total:

@@ -85,6 +85,13 @@ class Histogram:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Find:
+    """Asks for the labels whose number contains a text."""
+
+    text: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Preset:
     """Asks for a named transfer function over a window; those in Hounsfield units ignore it."""
 
@@ -180,8 +187,8 @@ class Do:
 
 
 Message = (
-    Hello | Move | Ack | Change | Pick | Histogram | Preset | Read | Export | Nodes | Resize | Set
-    | Follow | Monitor | Still | Surface | Do
+    Hello | Move | Ack | Change | Pick | Histogram | Find | Preset | Read | Export | Nodes | Resize
+    | Set | Follow | Monitor | Still | Surface | Do
 )  # fmt: skip
 MESSAGES: dict[str, type[Any]] = {message.__name__.lower(): message for message in Message.__args__}
 

@@ -38,6 +38,7 @@ from .state import ViewState
 
 BINS = 256  # of a histogram, at most
 _MAX_BOXES = 1500  # most boxes of nodes that are sent to a page
+_LABELS_PER_PART = 1 << 16  # labels that are searched at once
 _CHECKED_VALUES = 1 << 20  # values that are checked for being whole numbers
 EngineScene = Producer | Mapping[str, Producer]
 Remake = Callable[[Volume | Store | None], EngineScene]
@@ -58,6 +59,7 @@ class Scene:
     reopen: Callable[[int], Volume | Store] | None = None  # at another time; from any thread
     time: float = 0.0  # shown now: the number of a time point, or the time of producers' clocks
     _resident: Volume | None = field(default=None, repr=False)  # voxels of a tree
+    _labels: np.ndarray | None = field(default=None, repr=False)  # of the data that is shown
 
     def __post_init__(self) -> None:
         if self.times == 1 and (clocks := self._clocks()):
@@ -194,18 +196,23 @@ class Scene:
             return {"times": self.times, **time_axis}
         return {"times": None} if self._clocks() else None
 
-    def describe_labels(self) -> dict[str, Any] | None:
-        """Returns the first labels of the first channel, their default colours, and the number of
-        all labels; None if the channel has none.
+    def describe_labels(self, text: str = "") -> dict[str, Any] | None:
+        """Returns the first labels of the first channel whose number contains a text, their default
+        colours, and the number of all such labels; None if the channel has no labels.
         """
         tree = self.trees[0]
         channel = tree.channel_names[0]
         if channel not in tree.labels:
             return None
-        if tree.labels[channel] is None and isinstance(self.data, Volume):
-            names = self.data.data[..., 0].unique().cpu().numpy().astype(np.int64)
-        else:
-            names = label_rows(tree, channel)[1]
+        if self._labels is None:
+            if tree.labels[channel] is None and isinstance(self.data, Volume):
+                self._labels = self.data.data[..., 0].unique().cpu().numpy().astype(np.int64)
+            else:
+                self._labels = label_rows(tree, channel)[1]
+        names = self._labels
+        if text:  # in parts, since numbers take more memory as texts
+            parts = np.array_split(names, len(names) // _LABELS_PER_PART + 1)
+            names = np.concatenate([p[np.char.find(p.astype(str), text) >= 0] for p in parts])
         first = names[:MAX_ITEMS]
         colors = Labels()(first)[:, :3].round(4)
         return {"names": first.tolist(), "colors": colors.tolist(), "count": len(names)}
@@ -264,6 +271,7 @@ class Scene:
         """
         if self.engine is None or self.remake is None or remake is None:
             raise ValueError("view: the engine was passed in: its owner sets its memory")
+        self._labels = None
         old_options = self.engine.options
         new_options = replace(old_options, **options)
         producer = remake(data)
@@ -375,13 +383,11 @@ def _open_data(what: Any) -> Volume | Store:
         raise ValueError(f"view: takes {accepted}: {error}") from None
 
 
-def node_boxes(
-    tree: N3Tree, eye: tuple[float, float, float], limit: int = _MAX_BOXES
-) -> dict[str, Any]:
+def node_boxes(tree: N3Tree, eye: tuple[float, float, float]) -> dict[str, Any]:
     """Returns the nodes whose bricks the last frame read, those nearest to an eye first.
 
     Returns:
-        boxes: At most `limit` [x, y, z, depth], see `N3Tree.loc`.
+        boxes: At most _MAX_BOXES [x, y, z, depth], see `N3Tree.loc`.
         count: Number of all these nodes.
         low, size: World corner and sides of the root.
         branching: N.
@@ -396,7 +402,7 @@ def node_boxes(
     fraction = float(tree.branching) ** -loc[:, 3:].to(torch.float64)
     centre = low + (loc[:, :3] + 0.5) * fraction * size  # (k, 3) world
     distance = (centre - torch.tensor(eye, dtype=torch.float64).to(centre)).norm(dim=1)
-    nearest = distance.argsort(stable=True)[:limit]
+    nearest = distance.argsort(stable=True)[:_MAX_BOXES]
     return {
         "boxes": loc[nearest].tolist(),
         "count": len(loc),

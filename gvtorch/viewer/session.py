@@ -94,7 +94,7 @@ class Session:
 
     def leave(self, client: Client) -> None:
         """Forgets a page."""
-        client.gone = True  # ends work for it
+        client.gone = True
         self.post(lambda: self._goodbye(client))
 
     def receive(self, client: Client, text: str | bytes) -> None:
@@ -151,6 +151,8 @@ class Session:
             if self._closed:
                 return
             self._closed = True
+            for client in list(self.clients.values()):
+                client.gone = True
             self._wake.notify()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=30)
@@ -162,8 +164,6 @@ class Session:
             pass
         if self._planes is not None:
             self._planes.close()
-        if self._export is not None:
-            self._export.end()
         for client in self.clients.values():
             client.end()
         self.clients.clear()
@@ -318,8 +318,6 @@ class Session:
     def _goodbye(self, client: Client) -> None:
         self.clients.pop(client.number, None)
         client.end()
-        if self._export is not None and self._export.serves(client):
-            self._export.end()
         for other in self.clients.values():
             if other.follows == client.number:
                 other.follows = None
@@ -405,7 +403,7 @@ class Session:
 
     def _refresh_planes(self) -> None:
         for client in self.clients.values():
-            client.mark_planes_changed()
+            client.planes_changed = True
 
     def _update_time(self) -> None:
         """Shows the time of the state: a clock's at once, a series' once a thread has read it."""
@@ -464,6 +462,12 @@ class Session:
     def _take_histogram(self, client: Client, message: protocol.Histogram) -> None:
         histogram = self.scene.histogram(self.state.component, message.in_view)
         client.send_message("histogram", **histogram)
+
+    def _take_find(self, client: Client, message: protocol.Find) -> None:
+        labels = self.scene.describe_labels(message.text)
+        if labels is None:
+            raise ValueError("find: this scene has no labels")
+        client.send_message("found", text=message.text, **labels)
 
     def _take_preset(self, client: Client, message: protocol.Preset) -> None:
         name = message.name

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
+from ..base.records import RenderStats
 from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.models import MODELS, CameraModel, model_of
@@ -34,12 +35,6 @@ Triple = tuple[float, float, float]
 _MAX_COORDINATE = 1e30  # largest coordinate, so that a ray's numbers stay finite
 _MIN_DISTANCE = 1e-100  # from eye to target, so that its square does not become 0
 Show = Literal["picture", "samples", "nodes", "lod", "age", "fill"]
-
-
-def _set(record: Any, **checked: Any) -> None:
-    """Sets fields of a frozen record to what their checks returned."""
-    for name, value in checked.items():
-        object.__setattr__(record, name, value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,8 +58,8 @@ class Eye:
 
     def __post_init__(self) -> None:
         for name in ("eye", "target", "up"):
-            _set(self, **{name: check.triple("Eye", name, getattr(self, name))})
-        _set(self, fov=model_of("Eye", self.model).checked_fov("Eye", self.fov))
+            vars(self)[name] = check.triple("Eye", name, getattr(self, name))
+        vars(self)["fov"] = model_of("Eye", self.model).checked_fov("Eye", self.fov)
         if max(abs(number) for number in (*self.eye, *self.target, *self.up)) > _MAX_COORDINATE:
             raise ValueError(f"Eye: eye, target and up must be at most {_MAX_COORDINATE:g}")
         if math.dist(self.eye, self.target) < _MIN_DISTANCE or not any(self.up):
@@ -148,7 +143,7 @@ class Development:
     def __post_init__(self) -> None:
         samples = check.integer("Development", "samples", self.samples, low=1, high=65536)
         exposure = checked_curve("Development", self.tone, self.exposure)
-        _set(self, samples=samples, exposure=exposure)
+        vars(self).update(samples=samples, exposure=exposure)
 
     def develop(self, picture: Picture) -> Picture:
         """Returns the picture with its light mapped to the display."""
@@ -157,10 +152,21 @@ class Development:
         return picture.tone_map(self.tone, exposure=self.exposure)
 
     def take(self, render: Callable[[Camera], Picture], camera: Camera) -> Picture:
-        """Renders the picture of a camera at rest: the mean of all samples, developed."""
+        """Renders the picture of a camera at rest: the mean of all samples, developed. Its
+        statistics have the times, rays and samples of all of them.
+        """
         if self.samples == 1:
             return self.develop(render(camera))
-        return self.develop(Progressive(render).refine(camera, self.samples))
+        stats: list[RenderStats] = []
+
+        def counted(view: Camera) -> Picture:
+            picture = render(view)
+            stats.append(picture.stats)
+            return picture
+
+        mean = Progressive(counted).refine(camera, self.samples)
+        total = reduce(lambda before, now: now.after(before), stats)
+        return self.develop(replace(mean, stats=total))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,9 +186,9 @@ class Slices:
 
     def __post_init__(self) -> None:
         if self.position is not None:
-            _set(self, position=check.triple("Slices", "position", self.position))
+            vars(self)["position"] = check.triple("Slices", "position", self.position)
         if self.window is not None:
-            _set(self, window=window_of("Slices", self.window))
+            vars(self)["window"] = window_of("Slices", self.window)
         check.one_of("Slices", "colors", self.colors, ("gray", "shader"))
 
 
@@ -216,14 +222,13 @@ class ViewState:
         check.instance("ViewState", "shader", self.shader, Shader)
         check.instance("ViewState", "options", self.options, RenderOptions)
         check.one_of("ViewState", "show", self.show, get_args(Show))
-        _set(
-            self,
+        vars(self).update(
             component=check.integer("ViewState", "component", self.component, low=0),
             blend=check.number("ViewState", "blend", self.blend, low=0, high=1),
             time=check.number("ViewState", "time", self.time),
         )
         if self.component != self.options.component:
-            _set(self, options=replace(self.options, component=self.component))
+            vars(self)["options"] = replace(self.options, component=self.component)
 
     @property
     def is_plain(self) -> bool:

@@ -67,6 +67,7 @@ export class App {
     on("clients", ({ clients }) => { this.clients = clients; this.refresh(); });
     on("histogram", (message) => this.panel?.editor.setHistogram(message));
     on("preset", (message) => this.presets.receive(message));
+    on("found", (message) => this.panel?.labels.receive(message));
     on("nodes", (message) => this.nodes.receive(message));
     on("note", ({ text }) => this.notify(text));
     on("picked", (message) => this.picked(message));

@@ -39,12 +39,12 @@ export class ClipEditor {
     return this.inWorld ? box : box.map((point) => add(times(point, this.side), this.middle));
   }
 
-  /** Plane n in the world: unit normal, to the kept side, and offset. */
+  /** Plane n in the world: unit normal, to the kept side, offset, and the point nearest to the scene's middle. */
   plane(n) {
     const [a, b, c, d] = this.clip.planes[n], length = Math.hypot(a, b, c);
-    const normal = [a / length, b / length, c / length];
-    if (this.inWorld) return { normal, offset: d / length };
-    return { normal, offset: (d / length) * this.side - dot(normal, this.middle) };
+    const normal = [a / length, b / length, c / length], { middle } = this;
+    const offset = this.inWorld ? d / length : (d / length) * this.side - dot(normal, middle);
+    return { normal, offset, anchor: add(middle, times(normal, -(dot(normal, middle) + offset))) };
   }
 
   setClip(clip, rest) {
@@ -130,8 +130,7 @@ export class ClipEditor {
   }
 
   drawPlane(context, n, handles) {
-    const { view, camera } = this, { normal, offset } = this.plane(n);
-    const anchor = add(this.middle, times(normal, -(dot(normal, this.middle) + offset)));
+    const { view, camera } = this, { normal, offset, anchor } = this.plane(n);
     const rim = this.rim(normal, offset, anchor).map((point) => projected(camera, point));
     if (rim.length > 2 && rim.every(Boolean)) {
       context.beginPath();
@@ -146,12 +145,7 @@ export class ClipEditor {
     const tip = add(anchor, times(normal, -ARROW * this.side));  // towards what is cut away
     const size = this.side * 0.01, projection = this.step(anchor, times(normal, -size)), end = projected(camera, tip);
     if (!projection || !end) return;
-    context.strokeStyle = `rgb(${WARM})`;
-    context.lineWidth = 2 * view.ratio;
-    context.beginPath();
-    context.moveTo(...projection.at);
-    context.lineTo(...view.pixel(end));
-    context.stroke();
+    view.line(context, `rgb(${WARM})`, 2, projection.at, view.pixel(end));
     const move = (amount) => {
       const current = this.plane(n);
       this.putPlane(n, current.normal, current.offset + amount);
@@ -164,8 +158,7 @@ export class ClipEditor {
 
   /** Turns a plane around its handle: the end of its arrow follows the pointer. */
   tilt(n, dx, dy) {
-    const { camera } = this, { normal, offset } = this.plane(n);
-    const anchor = add(this.middle, times(normal, -(dot(normal, this.middle) + offset)));
+    const { camera } = this, { normal, anchor } = this.plane(n);
     const tip = add(anchor, times(normal, -ARROW * this.side));
     const { right, up } = axes(camera), depth = projected(camera, tip)?.depth;
     if (!depth) return;

@@ -8,7 +8,8 @@ export class LabelTable {
   constructor(app) {
     this.app = app;
     this.search = "";
-    this.filter = el("input", { type: "text", placeholder: "find a label", oninput: () => { this.search = this.filter.value.trim(); this.fill(); } });
+    this.found = null;  // the labels of a search that the server made; null: `app.labels`
+    this.filter = el("input", { type: "text", placeholder: "find a label", oninput: () => { this.search = this.filter.value.trim(); this.find(); } });
     this.body = el("div.gv-labels");
   }
 
@@ -33,6 +34,24 @@ export class LabelTable {
     return visible === null ? name !== 0 : (Array.isArray(visible) ? visible.includes(name) : true);
   }
 
+  /** Finds the labels whose number contains the text: here, or by the server if not all are here. */
+  find() {
+    const { names, count } = this.app.labels;
+    if (names.length < count && this.search) {
+      if (!this.asked) this.app.link.send("find", { text: this.asked = this.search });
+      return;
+    }
+    this.found = null;
+    this.fill();
+  }
+
+  receive(found) {
+    this.asked = "";
+    this.found = found;
+    if (found.text === this.search) this.fill();
+    else this.find();
+  }
+
   rows() {
     const { labels } = this.app;
     if (this.shader.kind !== "Labels" || !labels) return [];
@@ -46,22 +65,21 @@ export class LabelTable {
   }
 
   fill() {
-    const { names, colors, count } = this.app.labels, { chosen } = this;
+    const { names, colors, count } = this.found ?? this.app.labels, { chosen } = this;
     const matches = names.map((_, n) => n).filter((n) => String(names[n]).includes(this.search));
     const rows = matches.slice(0, MAX_ROWS).map((n) => this.row(names[n], chosen[names[n]] ?? colors[n]));
-    const note = (n, text) => (n ? [el("div.gv-dim", {}, `${n} ${text}`)] : []);
-    this.body.replaceChildren(...rows, ...note(matches.length - rows.length, "more: find them by number"),
-      ...note(count - names.length, `labels above ${names.at(-1)} have no row`));
+    const more = matches.length + count - names.length - rows.length;
+    this.body.replaceChildren(...rows, ...(more ? [el("div.gv-dim", {}, `${more} more: find them by number`)] : []));
   }
 
   row(name, color) {
     const paint = (rest) => (event) => this.change({ colors: { ...this.chosen, [name]: linear(event.target.value) } }, rest);
+    const { visible } = this.shader, { names, count } = this.app.labels, isListed = Array.isArray(visible);
     const visibleWith = (on) => {
-      const shown = this.app.labels.names.filter((label) => this.shows(label) && label !== name);
+      const shown = (isListed ? visible : names.filter((label) => this.shows(label))).filter((label) => label !== name);
       return on ? [...shown, name].sort((a, b) => a - b) : shown;
     };
-    const { visible } = this.shader, { names, count } = this.app.labels;
-    const disabled = count > names.length && !Array.isArray(visible);  // a list would hide those without a row
+    const disabled = count > names.length && !isListed;  // a list would hide those that are not here
     return el("div.gv-row.gv-label", {},
       el("input.gv-flag", { type: "checkbox", title: disabled ? "There are too many labels to hide one of them" : "Show it", disabled, checked: this.shows(name), onchange: (event) => this.change({ visible: visibleWith(event.target.checked) }) }),
       el("input.gv-color", { type: "color", title: "Its colour", value: hex(color), oninput: paint(false), onchange: paint(true) }),

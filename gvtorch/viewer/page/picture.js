@@ -125,6 +125,16 @@ export class PictureView {
     context.stroke();
   }
 
+  /** Draws a line through canvas pixels. */
+  line(context, color, width, first, ...others) {
+    context.strokeStyle = color;
+    context.lineWidth = width * this.ratio;
+    context.beginPath();
+    context.moveTo(...first);
+    for (const position of others) context.lineTo(...position);
+    context.stroke();
+  }
+
   /** Draws a handle. */
   dot(context, position, color, size = 6) {
     context.beginPath();
@@ -164,12 +174,8 @@ export class PictureView {
     for (const { axis, x, y, z } of order) {
       const end = [middle[0] + x * size, middle[1] + y * size];
       context.globalAlpha = z > 0.3 ? 0.55 : 1;
-      context.strokeStyle = context.fillStyle = COLORS[axis];
-      context.lineWidth = 2.2 * this.ratio;
-      context.beginPath();
-      context.moveTo(...middle);
-      context.lineTo(...end);
-      context.stroke();
+      this.line(context, COLORS[axis], 2.2, middle, end);
+      context.fillStyle = COLORS[axis];
       context.font = `600 ${12 * this.ratio}px system-ui, sans-serif`;
       context.textAlign = "center";
       context.textBaseline = "middle";
@@ -195,20 +201,9 @@ export class PictureView {
     const span = size / pixelSize, y = top + height - (this.app.time ? 62 : 26) * this.ratio;
     const middle = left + width / 2, [a, b] = [middle - span / 2, middle + span / 2];
     const text = `${short(size)} ${this.app.unit}`.trim();
-    const draw = () => {
-      context.beginPath();
-      context.moveTo(a, y - 4 * this.ratio);
-      context.lineTo(a, y);
-      context.lineTo(b, y);
-      context.lineTo(b, y - 4 * this.ratio);
-      context.stroke();
-    };
-    context.strokeStyle = "rgba(0,0,0,.55)";
-    context.lineWidth = 4 * this.ratio;
-    draw();
-    context.strokeStyle = "rgba(255,255,255,.88)";
-    context.lineWidth = 1.5 * this.ratio;
-    draw();
+    const tip = y - 4 * this.ratio, ends = [[a, tip], [a, y], [b, y], [b, tip]];
+    this.line(context, "rgba(0,0,0,.55)", 4, ...ends);
+    this.line(context, "rgba(255,255,255,.88)", 1.5, ...ends);
     this.label(context, text, middle, y - 5 * this.ratio, "center");
   }
 }

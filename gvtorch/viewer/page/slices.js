@@ -65,19 +65,12 @@ export class SlicesView {
       const { pane, image, columns, rows, name } = layout[axis];
       const toPixel = ([axisName, first, last], start, size) => start + ((position[AXES.indexOf(axisName)] - first) / (last - first)) * size;
       const [x, y] = [toPixel(columns, image[0], image[2]), toPixel(rows, image[1], image[3])];
-      const line = (color, ...ends) => {
-        context.strokeStyle = COLORS[AXES.indexOf(color)];
-        context.globalAlpha = 0.75;
-        context.lineWidth = ratio;
-        context.beginPath();
-        context.moveTo(...ends.slice(0, 2));
-        context.lineTo(...ends.slice(2));
-        context.stroke();
-        context.globalAlpha = 1;
-      };
-      line(columns[0], x, image[1], x, image[1] + image[3]);  // where the plane across that axis cuts this one
-      line(rows[0], image[0], y, image[0] + image[2], y);
-      context.strokeStyle = COLORS[AXES.indexOf(axis)];
+      const colorOf = (axisName) => COLORS[AXES.indexOf(axisName)];
+      context.globalAlpha = 0.75;  // where the planes across the other axes cut this one
+      this.view.line(context, colorOf(columns[0]), 1, [x, image[1]], [x, image[1] + image[3]]);
+      this.view.line(context, colorOf(rows[0]), 1, [image[0], y], [image[0] + image[2], y]);
+      context.globalAlpha = 1;
+      context.strokeStyle = colorOf(axis);
       context.lineWidth = ratio;
       context.strokeRect(pane[0] + 0.5, pane[1] + 0.5, pane[2] - 1, pane[3] - 1);
       const number = Number(position[AXES.indexOf(axis)].toPrecision(5));
