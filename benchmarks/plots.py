@@ -5,6 +5,7 @@ between the markers of docs/performance/tables.md. Records of quick sizes are le
 from __future__ import annotations
 
 import json
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,12 +38,12 @@ def read(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     return sorted(full_size, key=lambda item: order.index(item[1]["workload"]))
 
 
-def section(folder: str, name: str, record: dict[str, Any], drawn: bool) -> str:
-    """Returns a record's part of the page."""
+def section(picture: Path, record: dict[str, Any], drawn: bool) -> str:
+    """Returns a record's part of the page, which is linked to its `picture`."""
     text = WORKLOADS[record["workload"]]
     head = f"## {tables.title(record)}\n\n{text[0].upper()}{text[1:]}.\n"
-    picture = f"\n![{record['workload']}]({folder}/{name}.png)\n" if drawn else ""
-    return f"{head}{picture}\n{tables.markdown(record)}\n"
+    link = f"\n![{record['workload']}]({picture.as_posix()})\n" if drawn else ""
+    return f"{head}{link}\n{tables.markdown(record)}\n"
 
 
 def write_between_markers(page: Path, text: str) -> None:
@@ -133,9 +134,10 @@ def main(settings: Settings) -> None:
     if not records:
         sys.exit(f"plots: no records in {settings.records}; `make bench` makes them")
     parts, plots = [], 0
+    folder = Path(os.path.relpath(settings.records, settings.page.parent))
     for name, record in records:
         drawn = draw(settings.records / f"{name}.png", record)
-        parts.append(section(settings.records.name, name, record, drawn))
+        parts.append(section(folder / f"{name}.png", record, drawn))
         plots += drawn
     write_between_markers(settings.page, "\n".join(parts))
     print(f"{settings.page}: {len(records)} tables, {plots} plots")
