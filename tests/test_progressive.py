@@ -229,9 +229,18 @@ def test_an_engine_streams_strip_by_strip(blobs, tmp_path):
     camera = gv.Camera.orbit(distance=1.2, width=40, height=50)
     whole = gv.render(gv.N3Tree.from_volume(blobs, 4), camera, GRAY)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4) as engine:
-        render = partial(engine.render, shader=GRAY)
+        parts = []
+
+        def render(strip):
+            picture = engine.render(strip, GRAY)
+            parts.append(picture.stats)
+            return picture
+
         stats = gv.render_tiles(render, camera, tmp_path / "a.npy", memory=40 * 400 * 12)
-    assert stats.converged and stats.rays == 2000
+    assert stats.converged and stats.rays == 2000 and len(parts) > 1
+    assert stats.frames == sum(part.frames for part in parts)
+    assert stats.produced["bricks"] == sum(part.produced["bricks"] for part in parts) > 0
+    assert stats.bricks_used == max(part.bricks_used for part in parts)
     np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], whole.color, atol=1e-6)
 
 

@@ -125,12 +125,19 @@ class FrameStats(RenderStats):
         )
 
     def after(self, before: RenderStats) -> RenderStats:
-        """See `RenderStats.after`; the whole has converged if both parts have."""
-        combined = super().after(before)
-        if isinstance(combined, FrameStats) and isinstance(before, FrameStats):
-            combined.converged &= before.converged
-            combined.capacity_exceeded |= before.capacity_exceeded
-        return combined
+        """See `RenderStats.after`; frames and what they made are added, too, and the whole has
+        converged if both parts have.
+        """
+        if not isinstance(before, FrameStats):
+            return super().after(before)
+        return replace(
+            self.following(before),
+            rays=before.rays + self.rays,
+            samples=before.samples + self.samples,
+            frames=before.frames + self.frames,
+            converged=before.converged and self.converged,
+            capacity_exceeded=before.capacity_exceeded or self.capacity_exceeded,
+        )
 
     @property
     def miss_rate(self) -> float:
