@@ -37,6 +37,11 @@ def with_type(error: BaseException) -> str:
     return f"{name}: {one_line(error)}" if str(error).strip() else name
 
 
+def reason(error: BaseException) -> str:
+    """Returns in one line why something failed: a ValueError's own words, or `with_type`."""
+    return one_line(error) if isinstance(error, ValueError) else with_type(error)
+
+
 def printable(text: object) -> str:
     """Returns a text with control characters escaped, as in "\\x1b": names and contents of files
     are untrusted.

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
-from ..base.messages import with_type
+from ..base.messages import reason, with_type
 from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
@@ -189,8 +189,8 @@ def valid_part(
     """
     try:
         checked = batch.check(answer)
-    except Exception as error:
-        fail(batch, str(error) if isinstance(error, ValueError) else with_type(error), error)
+    except Exception as error:  # a user's answer may hold anything
+        fail(batch, reason(error), error)
         return None
     if checked.errors:
         reasons: dict[int, str] = {}  # by index in the batch

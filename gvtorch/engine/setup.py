@@ -10,7 +10,7 @@ import torch
 
 from ..base import check
 from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
-from ..base.messages import one_line, with_type
+from ..base.messages import reason
 from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import write_slots
@@ -269,9 +269,8 @@ def fill_root(cache: Cache, source: ProducedTree) -> None:
     try:
         _fill_root(cache, source)
     except Exception as error:
-        message = one_line(error) if isinstance(error, ValueError) else with_type(error)
         raise ProductionError(
-            f"Engine: the root of tree {source.name!r} can't be made: {message}"
+            f"Engine: the root of tree {source.name!r} can't be made: {reason(error)}"
         ) from error
 
 

@@ -181,7 +181,9 @@ class Shader(Checked):
 
     def feature_count(self, tree: N3Tree) -> int:
         """Returns the width c of `Hits.features` (r, c)."""
-        count = SHADER_KINDS[self.kind or "Lit"].twin.feature_count
+        if self.kind is None:
+            return 0
+        count = SHADER_KINDS[self.kind].twin.feature_count
         return tree.bricks.channels[str(self.other)].width if count is None else count
 
     def parameter_tensor(self, tree: N3Tree, dtype: torch.dtype) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from functools import partial
@@ -99,12 +99,7 @@ def convert(
     """
     target = Path(store)
     make_source = partial(source_of, source, spacing, origin, time, oblique, labels, options)
-    if resume and unfinished.is_finished(target) and (finished := Store.open(target)).has_blocks:
-        with suppress(FileNotFoundError):  # the source may be gone once the store is finished
-            opened = make_source(read=False)
-            times = opened.times if time is None else 1
-            _check_finished(finished, opened, times, block, threshold)
-        shutil.rmtree(target / WORK, ignore_errors=True)  # left if it was killed in its last step
+    if resume and (finished := _finished(target, make_source, time, block, threshold)):
         return finished
     begun = unfinished.is_begun(target, resume=resume)
     prepared = indexed_source(make_source(), time, workers, target / WORK, progress)
@@ -117,7 +112,24 @@ def convert(
     return Store.open(target)
 
 
-def _check_finished(
+def _finished(
+    target: Path,
+    make_source: Callable[..., VolumeSource],
+    time: int | None,
+    block: int,
+    threshold: float | None,
+) -> Store | None:
+    """Returns the store if it is finished; raises ValueError if another one would be written."""
+    if not unfinished.is_finished(target) or not (store := Store.open(target)).has_blocks:
+        return None
+    with suppress(FileNotFoundError):  # the source may be gone once the store is finished
+        source = make_source(read=False)
+        _check_same(store, source, source.times if time is None else 1, block, threshold)
+    shutil.rmtree(target / WORK, ignore_errors=True)  # left if it was killed in its last step
+    return store
+
+
+def _check_same(
     store: Store, source: VolumeSource, times: int, block: int, threshold: float | None
 ) -> None:
     """Raises ValueError if a finished store differs from the one that would be written."""
