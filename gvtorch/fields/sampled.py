@@ -189,9 +189,7 @@ def _apart(values: Tensor, spacing: Tensor) -> Tensor:
         difference = (
             (values[tuple(start_slices)] - values[tuple(end_slices)]).abs().amax().to(torch.float64)
         )
-        steepest = torch.maximum(
-            steepest, difference / length(torch.tensor(step).to(spacing) * spacing)
-        )
+        steepest = torch.maximum(steepest, difference / length(spacing.new_tensor(step) * spacing))
     is_cubic = bool((spacing == spacing[0]).all())
     return steepest * (1.1282 if is_cubic else math.sqrt(3))
 

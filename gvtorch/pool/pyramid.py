@@ -110,9 +110,14 @@ def volume_levels(
             )
             low, high = pool_min(low, branching), pool_max(high, branching)
         summary = NodeSummary(
-            low=torch.as_tensor(by_node(low, "min", brick_size, border)),
-            high=torch.as_tensor(by_node(high, "max", brick_size, border)),
-            mean=torch.as_tensor(by_node(values, node_reduction(volume.filter), brick_size, 0)),
+            low=torch.as_tensor(by_node(low, "min", brick_size, border), device=volume.data.device),
+            high=torch.as_tensor(
+                by_node(high, "max", brick_size, border), device=volume.data.device
+            ),
+            mean=torch.as_tensor(
+                by_node(values, node_reduction(volume.filter), brick_size, 0),
+                device=volume.data.device,
+            ),
         )
         stored = volume.data if level == 0 else from_grid(values, dtype)
         yield Level(values=stored, nodes=summary)
