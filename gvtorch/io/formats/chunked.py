@@ -23,7 +23,7 @@ from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
 from ..cf_source import CfSource, cf_fields, unpack_coordinates
-from ..source import Index, Triple, VolumeSource
+from ..source import Index, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import is_number
@@ -192,10 +192,7 @@ def open_n5(path: str, key: str | None = None, axes: str | None = None) -> Chunk
         metadata = (_describe_array(folder) or ("", {}))[1]
     source, shape = _open_source(path, "n5", folder)
     axis_order = ask_axes(path, shape[::-1], axes)[::-1]
-    spacing, origin, unit = _n5_placement(metadata, axis_order)
-    return replace(
-        source, axes=axis_order, spacing=spacing, origin=origin, info=ImageInfo(unit=unit)
-    )
+    return replace(source, axes=axis_order, **_n5_placement(metadata, axis_order))
 
 
 def _choose_array(path: str, key: str | None) -> str:
@@ -222,8 +219,8 @@ def _open_source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tu
     return replace(source, shape=shape, stored=dtype.str, packed=dtype.str), shape
 
 
-def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Triple, str | None]:
-    """Returns voxel size, origin and unit of an N5 array; `axis_order`: the fastest first."""
+def _n5_placement(metadata: dict[str, Any], axis_order: str) -> dict[str, Any]:
+    """Returns spacing, origin and info of an N5 array; `axis_order`: the fastest first."""
     rank = len(axis_order)
     sizes: Any = metadata.get("pixelResolution", metadata.get("resolution"))
     unit: Any = metadata.get("units", metadata.get("unit"))
@@ -242,10 +239,9 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
     voxel_size = [abs(steps.get(a, 1.0) * factors.get(a, 1.0)) for a in "xyz"]
     spacing, unit_name = spacing_of(voxel_size, [unit if isinstance(unit, str) else None] * 3)
     # A coarse voxel's centre is that of the fine ones in it: (f - 1) / 2 of them further.
-    x, y, z = (
-        starts.get(a, 0.0) + (factors.get(a, 1.0) - 1) / 2 * abs(steps.get(a, 1.0)) for a in "xyz"
-    )
-    return spacing, (x, y, z), unit_name
+    shifts = {a: (factors.get(a, 1.0) - 1) / 2 * abs(steps.get(a, 1.0)) for a in "xyz"}
+    position = tuple(starts.get(a, 0.0) + shift for a, shift in shifts.items())
+    return {"spacing": spacing, "origin": position, "info": ImageInfo(unit=unit_name)}
 
 
 def _numbers_or_default(values: Any, default: float, count: int) -> list[float]:

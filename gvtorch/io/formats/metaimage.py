@@ -62,9 +62,7 @@ def open_metaimage(path: str) -> VolumeSource:
     data_name = header["ElementDataFile"]
     data_file = str(Path(path).parent / data_name)
     if data_name.upper() == "LIST" or ("%" in data_name and not os.path.exists(data_file)):
-        raise ValueError(
-            f"{path}: its slices are in separate files (ElementDataFile = {data_name})"
-        )
+        raise ValueError(f"{path}: its slices are in several files (ElementDataFile = {data_name})")
     is_local = data_name.upper() == "LOCAL"
     data_file = path if is_local else data_file
     header_size = int(header.get("HeaderSize", 0))
@@ -110,9 +108,7 @@ def _is_true(header: dict[str, str], *names: str) -> bool:
 
 
 def _numbers(path: str, header: dict[str, str], count: int, *names: str) -> np.ndarray | None:
-    """Returns the `count` numbers of the first field of `names` that the header has; None if it
-    has none of them.
-    """
+    """Returns `count` numbers of the first field that the header has; None if it has none."""
     text = next((header[name] for name in names if name in header), None)
     values = np.array([float(v) for v in text.split()]) if text else None
     if values is not None and len(values) != count:
