@@ -217,9 +217,8 @@ def _read_content(
     # `read1` ends without an error where a server breaks off.
     if response.length and (stop is None or content_start + len(content) < stop):
         raise OSError(f"cut off: {response.length} bytes are missing")
-    wanted = (
-        content[start:] if start < 0 else content[: None if stop is None else stop - content_start]
-    )
+    end = None if stop is None else stop - content_start
+    wanted = content[start:] if start < 0 else content[:end]
     if len(wanted) > max_bytes:
         raise Endless(f"the server sends more than {max_bytes} bytes")
     return bytes(wanted)
@@ -253,9 +252,7 @@ def is_forbidden(error: OSError) -> bool:
 def _send_request(
     url: str, headers: dict[str, str], seconds: float
 ) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
-    """Sends a request; returns the connection (None if it is urllib's) and the answer, whose body
-    is not read yet.
-    """
+    """Returns a connection (None if it is urllib's), and the answer, whose body is not read yet."""
     url_parts = urllib.parse.urlsplit(_quoted(url))
     request_target = url_parts.path + (f"?{url_parts.query}" if url_parts.query else "")
     proxied = url_parts.scheme in urllib.request.getproxies()

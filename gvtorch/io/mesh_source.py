@@ -136,10 +136,7 @@ def voxelize(
     **settings: Unpack[GridSettings],
 ) -> Store:
     """Writes a mesh into a store, out of core: memory holds only the mesh and a few cubes of
-    voxels.
-
-    Large stores are written by worker processes; a script that calls this needs the usual
-    `if __name__ == "__main__":` around its work.
+    voxels. Large stores are written by worker processes, see `convert`.
 
     Args:
         mesh: A `Mesh`, or a file that `read_mesh` can read.

@@ -76,11 +76,13 @@ class PointFile:
             with convert_errors(ValueError, str(self.path), "can't be read"):
                 fields = {name: self._join_columns(used, part) for name, used in self.used.items()}
                 if "colors" in fields:
+                    colors = fields["colors"][:, :3]
                     dtypes = {self.columns[name].dtype for name in self.used["colors"]}
-                    fields["colors"] = _linear_colors(fields["colors"][:, :3], dtypes)
+                    if all(dtype.kind in "iu" for dtype in dtypes):  # whole numbers are sRGB
+                        colors = array_from_srgb(colors / max(np.iinfo(d).max for d in dtypes))
+                    fields["colors"] = colors
                 radius = fields["radius"][:, 0] if "radius" in fields else self._constant
-                values, colors = fields.get("values"), fields.get("colors")
-                yield Points(fields["positions"], values, colors, radius)
+                yield Points(**{**fields, "radius": radius})
 
     def _join_columns(self, names: Sequence[str], part: slice) -> np.ndarray:
         columns = (np.asarray(self.columns[name][part]) for name in names)
@@ -222,9 +224,7 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
 
 
 def _text_column(name: str, values: np.ndarray, kind: str) -> np.ndarray:
-    """Returns the float64 values of a column in its dtype; raises ValueError if an integer is not
-    whole, or out of range.
-    """
+    """Returns float64 values in a column's dtype; raises ValueError if an integer does not fit."""
     with np.errstate(all="ignore"):
         column: np.ndarray = values.astype(kind)
     if column.dtype.kind in "iu" and (column != values).any():
@@ -313,10 +313,3 @@ def _choose_columns(
         if role in chosen and total not in sizes:
             raise ValueError(f"{path}: {role} must be {sizes[0]} numbers, the columns are {total}")
     return chosen
-
-
-def _linear_colors(colors: np.ndarray, dtypes: set[Any]) -> np.ndarray:
-    """Converts whole numbers, which are sRGB, to linear colours; others are linear already."""
-    if not all(column_dtype.kind in "iu" for column_dtype in dtypes):
-        return colors
-    return array_from_srgb(colors / max(np.iinfo(column_dtype).max for column_dtype in dtypes))

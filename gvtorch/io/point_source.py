@@ -105,10 +105,8 @@ def splat(
     **names: Unpack[ColumnNames],
 ) -> Store:
     """Writes points into a store, out of core: they are sorted on disk, in the folder of the
-    unfinished store, and read from there part by part.
-
-    Large stores are written by worker processes; a script that calls this needs the usual
-    `if __name__ == "__main__":` around its work.
+    unfinished store, and read from there part by part. Large stores are written by worker
+    processes, see `convert`.
 
     Args:
         points: A file as in `read_points`, or `Points`.

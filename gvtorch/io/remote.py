@@ -45,11 +45,9 @@ def is_file_url(text: str) -> bool:
     """Returns whether a URL is of a file, with a file's ending, and not of a Zarr or N5 folder."""
     if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
         return False
-    name = _file_name(text)
-    ending = re.search(r"\.([A-Za-z]\w*)$", name)
-    return (
-        ending is not None and ending[1].lower() not in _FOLDER_ENDINGS and not text.endswith("/")
-    )
+    ending = re.search(r"\.([A-Za-z]\w*)$", _file_name(text))
+    is_file = ending is not None and ending[1].lower() not in _FOLDER_ENDINGS
+    return is_file and not text.endswith("/")
 
 
 def cache_limit() -> int:
