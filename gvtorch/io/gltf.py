@@ -160,7 +160,6 @@ class _Plain:
         return self._copies[key]
 
     def _split_fan(self, primitive: dict[str, Any]) -> None:
-        """Replaces a fan by its triangles."""
         if "indices" in primitive:
             corners = self._values(primitive["indices"])[:, 0].astype("<u4")
         else:

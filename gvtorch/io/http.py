@@ -100,17 +100,13 @@ def read_http(
     max_file_bytes = max_bytes if max_file_bytes is None else max_file_bytes
     try:
         return _read(url, max_bytes, byte_range, max_file_bytes, deadline)
-    except TimeoutError:
-        if seconds < max_seconds and time.monotonic() >= deadline:
-            raise
-        failure: OSError = Endless("the server sends hardly anything")
     except OSError as error:
-        failure = error
-    keep_reason(url, failure, REFUSED_SECONDS if isinstance(failure, Endless) else 0.0)
-    try:
-        raise failure from None
-    finally:
-        del failure  # its traceback holds this frame, and what was read
+        if isinstance(error, TimeoutError):
+            if seconds < max_seconds and time.monotonic() >= deadline:
+                raise
+            error = Endless("the server sends hardly anything")
+        keep_reason(url, error, REFUSED_SECONDS if isinstance(error, Endless) else 0.0)
+        raise error from None
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:

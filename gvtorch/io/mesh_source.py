@@ -94,7 +94,6 @@ class MeshSource(VolumeSource):
         return sources
 
     def staged(self, folder: Path) -> MeshSource:
-        """Writes the mesh to a file in the folder."""
         if self.mesh is None:
             return self
         file, arrays = folder / "mesh.npz", _mesh_arrays(self.mesh)
@@ -102,7 +101,6 @@ class MeshSource(VolumeSource):
         return dataclasses.replace(self, mesh=None, file=str(file))
 
     def fingerprint(self) -> list[Any]:
-        """Returns values that identify the mesh, the channel and the settings."""
         settings = {**dict(self.settings), "solid": self.solid}
         return [*self.identity, self.channel, *settings.values()]
 

@@ -60,7 +60,6 @@ class SplatSource(VolumeSource):
         )
 
     def fingerprint(self) -> list[Any]:
-        """Returns values that identify the points and the settings."""
         return list(self.identity)
 
     def read_stored(self, index: Index) -> np.ndarray:

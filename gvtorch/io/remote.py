@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 from urllib.parse import unquote, urlsplit
 
-from ..base.digits import whole_number
+from ..base.digits import finite_number, whole_number
 from ..base.messages import need_library, one_line
 from ..base.whole_file import cache_folder, write_text
 from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib, unpacked
@@ -53,11 +53,8 @@ def is_file_url(text: str) -> bool:
 def cache_limit() -> int:
     """Returns the most bytes that the cache may hold."""
     text = os.environ.get("GVTORCH_CACHE_GB", "50")
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = -1.0
-    if not 0 < limit < 1e6:
+    limit = finite_number(text)
+    if limit is None or not 0 < limit < 1e6:
         raise ValueError(f"GVTORCH_CACHE_GB must be gigabytes, got {text!r}")
     return int(limit * 1e9)
 

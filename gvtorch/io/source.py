@@ -178,12 +178,10 @@ class ArraySource(VolumeSource):
     exact: bool = False  # nothing may follow the array
 
     def check_file(self) -> None:
-        """Compares the file's size with what the array takes."""
         if not self.whole:
             self._check_size(os.stat(self.file).st_size - self.offset)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Maps the file, or unpacks it."""
         order: Any = "F" if self.fortran else "C"
         if not self.whole:
             dtype = np.dtype(self.stored)
@@ -224,7 +222,6 @@ class MemorySource(VolumeSource):
         return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **fields)
 
     def staged(self, folder: Path) -> VolumeSource:
-        """Writes the values to a file in the folder."""
         file = folder / "source.npy"
         with name_in_errors(file):
             save_npy(file, self.data)

@@ -277,7 +277,6 @@ def _stored_range(header: Any) -> tuple[int, int]:
 
 
 def _decode_images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
-    """Decodes some of the images of a file."""
     import pydicom
     from pydicom.pixels import iter_pixels
 

@@ -124,7 +124,6 @@ def _opened_slice(file: str) -> Iterator[tuple[Any, list[int]]]:
 
 
 def _decode_image(file: str) -> np.ndarray:
-    """Decodes an image."""
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
         with _opened_slice(file) as (series, axes):

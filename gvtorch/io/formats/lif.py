@@ -111,7 +111,6 @@ class _Axis(NamedTuple):
 
 
 def _axis(path: str, element: Any) -> _Axis:
-    """Returns an axis from its description."""
     number, size = int(element.get("DimID", 0)), int(element.get("NumberOfElements", 0))
     letter = _AXIS_LETTERS.get(number, "-")
     if letter == "-" and size > 1:

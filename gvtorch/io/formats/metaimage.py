@@ -81,23 +81,15 @@ def open_metaimage(path: str) -> VolumeSource:
 def _read_header(path: str) -> tuple[dict[str, str], int]:
     """Returns the header's values by name, up to ElementDataFile, and the offset of its end."""
     with open(path, "rb") as file:
-        text = file.read(_MAX_HEADER_BYTES)
+        text = file.read(_MAX_HEADER_BYTES).decode("latin-1")
     fields: dict[str, str] = {}
-    position = 0
-    while position < len(text):
-        end = text.find(b"\n", position)
-        end = len(text) if end < 0 else end
-        match = re.fullmatch(r"\s*(\w+)\s*[=:]\s*(.*?)\s*", text[position:end].decode("latin-1"))
-        position = end + 1
-        if match is None:
-            break
-        fields[match[1]] = match[2]
-        if match[1] == "ElementDataFile":
-            for name in ("DimSize", "ElementType"):
-                if name not in fields:
-                    raise ValueError(f"the header has no {name}")
-            return fields, position
-    raise ValueError("no MetaImage: the header has no ElementDataFile")
+    position, line = 0, re.compile(r"[^\S\n]*(\w+)[^\S\n]*[=:](.*)\n?")
+    while "ElementDataFile" not in fields and (match := line.match(text, position)):
+        fields[match[1]], position = match[2].strip(), match.end()
+    for name in ("ElementDataFile", "DimSize", "ElementType"):
+        if name not in fields:
+            raise ValueError(f"no MetaImage: the header has no {name}")
+    return fields, position
 
 
 def _is_true(header: dict[str, str], *names: str) -> bool:

@@ -64,7 +64,6 @@ class Cursor:
         return start
 
     def take(self, count: int) -> bytes:
-        """Reads bytes."""
         start = self.skip(count)
         return bytes(self.data[start : start + count])
 
@@ -73,11 +72,9 @@ class Cursor:
         return struct.unpack(layout, self.take(struct.calcsize(layout)))
 
     def number(self, layout: str) -> Any:
-        """Reads a number."""
         return self.numbers(layout)[0]
 
     def array(self, dtype: Any, count: int) -> np.ndarray:
-        """Reads an array."""
         dtype = np.dtype(dtype)
         return np.frombuffer(self.data, dtype, count, self.skip(count * dtype.itemsize))
 
@@ -86,7 +83,6 @@ class Cursor:
         return bits(self.data, self.skip(count // 8), count)
 
     def text(self, max_bytes: int = _MAX_NAME_BYTES) -> str:
-        """Reads a string."""
         length = self.number("<I")
         if length > max_bytes:
             raise ValueError(f"has a name of {length} bytes")

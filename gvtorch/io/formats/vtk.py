@@ -322,7 +322,6 @@ def _legacy_type(name: str) -> str:
 def _legacy_array(
     path: str, tokens: list[str], points: Sequence[int], cells: bool
 ) -> dict[str, Any]:
-    """Returns the description of an array from its header line."""
     kind = tokens[0].upper()
     if kind == "COLOR_SCALARS":
         name, dtype, width = tokens[1].replace("%%", "%"), "u1", int(tokens[2])  # VTK doubles the %

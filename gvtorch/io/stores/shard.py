@@ -193,7 +193,6 @@ def finish_write(future: Any, context: str, advice: str = RESUME_ADVICE) -> None
 
 
 def create_arrays(conversion: Conversion, level: int) -> None:
-    """Creates the empty arrays of a level."""
     layout = conversion.layout
     arrays = (layout.pyramid(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
@@ -201,7 +200,6 @@ def create_arrays(conversion: Conversion, level: int) -> None:
 
 
 def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
-    """Writes the table of indexed labels."""
     root, spec = conversion.root, conversion.layout.labels()
     create_array(root, spec)
     finish_write(begin_write(root, spec, [0], labels), root.get("path", "store"))

@@ -78,7 +78,6 @@ class UnfinishedStore:
 
 
 def is_finished(target: Path) -> bool:
-    """Returns whether there is a finished store."""
     return (target / "zarr.json").exists()
 
 
