@@ -242,7 +242,7 @@ class ChunkFiles:
             last = begin + len(content) - _BLOSC_HEADER_BYTES
             sent = entries[(entries[:, 0] >= begin) & (entries[:, 0] <= max(last, 0)), 0]
             starts = [start - begin for start in sent.tolist()]
-        self._check_blosc_headers(content[start:] for start in starts)
+        self._check_blosc_headers(content[s : s + _BLOSC_HEADER_BYTES] for s in starts)
 
     @property
     def _counted(self) -> tuple[int, ...]:
@@ -304,10 +304,8 @@ class ChunkFiles:
             return 0
         return 4 + 4 * len(self.file) + (4 if content[:2] != b"\0\0" else 0)
 
-    def _check_blosc_headers(self, chunks: Iterable[bytes]) -> None:
-        """Raises Endless if the header of a chunk, given its first bytes, declares too many."""
+    def _check_blosc_headers(self, headers: Iterable[bytes]) -> None:
         max_bytes = 2 * self.chunk_bytes + _ENTRY_BYTES
-        headers = (chunk[:_BLOSC_HEADER_BYTES] for chunk in chunks)
         sizes = [int.from_bytes(h[4:], "little") for h in headers if len(h) == _BLOSC_HEADER_BYTES]
         if (size := max(sizes, default=0)) > max_bytes:
             raise Endless(
