@@ -137,19 +137,19 @@ def order_frames(path: str, frames: Sequence[DicomFrame]) -> Ordered:
                 "put those of one kind into a folder of their own"
             )
     rows, columns = _directions(path, first)
-    affine = np.eye(4)
+    affine, normal = np.eye(4), np.cross(rows, columns)
     affine[:3, 1], affine[:3, 2] = columns * first.spacing[0], rows * first.spacing[1]
     if any(frame.position is None for frame in frames):
-        return _order_by_number(frames, affine, np.cross(rows, columns))
-    slices = _group_by_position(frames, np.cross(rows, columns))
+        return _order_by_number(frames, affine, normal)
+    slices = _group_by_position(frames, normal)
     count, attribute = _sort_times(path, slices)
     ordered = [[slice_frames[t] for slice_frames in slices] for t in range(count)]
     positions = np.array([slice_frames[0].position for slice_frames in slices])
     affine[:3, 3] = positions[0]
-    affine[:3, 0] = np.cross(rows, columns) * (first.slice_spacing or 1.0)
+    affine[:3, 0] = normal * (first.slice_spacing or 1.0)
     dropped = []
     if len(slices) > 1:
-        affine[:3, 0] = _step(path, positions, np.cross(rows, columns))
+        affine[:3, 0] = _step(path, positions, normal)
     elif first.slice_spacing is None:
         dropped.append("how thick its only slice is: it is 1 thick here")
     if attribute is not None and attribute not in (*_TIME_UNITS, *_DISTINGUISHING[:2]):

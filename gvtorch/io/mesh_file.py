@@ -115,7 +115,8 @@ def _read_content(path: Path) -> bytes:
     except (OSError, EOFError, zlib.error) as error:
         raise ValueError(f"{path}: can't be unpacked: {error}") from None
     if len(content) > max_bytes:
-        raise ValueError(f"{path}: unpacks to more than {amount(max_bytes)}, which memory can take")
+        limit = amount(max_bytes)
+        raise ValueError(f"{path}: unpacks to more than {limit}, what free memory can take")
     return content
 
 
@@ -145,19 +146,17 @@ def _parse_count(word: bytes) -> int:
 
 def _check_claims(path: Path, ending: str, content: bytes) -> None:
     """Raises ValueError, before memory is allocated, if a header claims too many triangles."""
-    claimed = None
+    claimed = 0
     if ending == "stl" and len(content) >= 84 and not content[:5].lower() == b"solid":
         claimed = int.from_bytes(content[80:84], "little")
     if ending == "ply":
         for line in content[:65536].partition(b"end_header")[0].splitlines():
             tokens = line.split()
             if tokens[:2] in ([b"element", b"face"], [b"element", b"vertex"]) and len(tokens) == 3:
-                claimed = max(claimed or 0, _parse_count(tokens[2]))
+                claimed = max(claimed, _parse_count(tokens[2]))
     if ending == "off":
         numbers = content[:4096].split()[1:3]
-        claimed = max((_parse_count(n) for n in numbers if n.isdigit()), default=None)
-    if claimed is None:
-        return
+        claimed = max(map(_parse_count, numbers), default=0)
     if claimed > (size := len(content)):  # each takes more than a byte
         raise ValueError(f"{path}: declares {claimed} triangles or vertices in {size} bytes")
     if claimed > MOST_FACES:

@@ -126,14 +126,18 @@ def splat(
     target = Path(store)
     check.one_of("splat", "channel", channel, CHANNELS)
     begun = is_begun(target, resume=resume)
-    source: Any = points if isinstance(points, Points) else PointFile(points, **names)
+    source: Any = points
+    if isinstance(points, Points):
+        columns = (points.positions, points.values, points.colors, points.radius)
+        path, version = "points", [len(points), checksum(c for c in columns if c is not None)]
+    else:
+        source, path, version = PointFile(points, **names), str(points), fingerprint(points)
     settings = {"extent": extent, "box": box, "channel": channel}
-    identity: list[Any] = [_points_identity(points), {**settings, "opacity": opacity, **names}]
+    identity: list[Any] = [version, {**settings, "opacity": opacity, **names}]
     if channel == "color":
         source = _LitPoints(source, check.number("splat", "opacity", opacity, low=0, high=1))
     folder = target / WORK / "points"
     _sort(source, folder, identity, begun, extent=extent, box=box, memory=memory, progress=progress)
-    path = "points" if isinstance(points, Points) else str(points)
     volume = SplatSource.of(folder, channel, path=path, identity=tuple(identity))
     options: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
     return convert(volume, target, resume=resume, progress=progress, **options)
@@ -159,11 +163,3 @@ def _sort(
         shutil.rmtree(folder.parent.parent, ignore_errors=True)  # nothing else is there
         raise
     write_json(record, identity_json)
-
-
-def _points_identity(points: str | Path | Points) -> list[Any]:
-    """Returns values that identify points: equal while these are unchanged."""
-    if not isinstance(points, Points):
-        return fingerprint(points)
-    columns = (points.positions, points.values, points.colors, points.radius)
-    return [len(points), checksum(column for column in columns if column is not None)]

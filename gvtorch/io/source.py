@@ -250,13 +250,15 @@ def microscope_info(
     """Returns an image's info: its channels, if there is one for each of the `width` numbers of a
     voxel; the time step and its unit, if the step is positive.
     """
+    fitting = tuple(channels) if len(channels) == width else ()
+    return ImageInfo(unit=unit, channels=fitting, **time_fields(step, step_unit))
+
+
+def time_fields(step: float | None, unit: str | None, origin: float = 0.0) -> dict[str, Any]:
+    """Returns time_step, time_unit and time_origin of an `ImageInfo`, as far as they are usable."""
     has_step = step is not None and 0 < step < math.inf
-    return ImageInfo(
-        unit=unit,
-        channels=tuple(channels) if len(channels) == width else (),
-        time_step=step if has_step else None,
-        time_unit=step_unit if has_step else None,
-    )
+    known: dict[str, Any] = {"time_step": step, "time_unit": unit} if has_step else {}
+    return known | {"time_origin": origin if math.isfinite(origin) else 0.0}
 
 
 def read_planes(

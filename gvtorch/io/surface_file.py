@@ -51,7 +51,6 @@ class SurfaceFile:
         """Describes the file: a .ply holds world positions, float32 if that resolves a thousandth
         of `step`, else float64; a .glb holds float32 relative to `origin`, its translation.
         """
-        check_surface_path("surface", path)
         self._path, self._origin = path, origin
         self._is_glb, self._step = path.suffix == ".glb", step
         self.vertices = self.triangles = 0

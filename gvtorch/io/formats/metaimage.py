@@ -17,7 +17,14 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.units import length_unit
-from ..source import LPS_TO_RAS, ArraySource, VolumeSource, number_type, place_axes
+from ..source import (
+    LPS_TO_RAS,
+    ArraySource,
+    VolumeSource,
+    number_type,
+    place_axes,
+    time_fields,
+)
 from ..text_source import TextSource
 from .format import Format
 
@@ -130,17 +137,13 @@ def _placement(
 def _info(path: str, header: dict[str, str], width: int, rank: int) -> ImageInfo:
     """Returns the header's metadata of the values."""
     modality = header.get("Modality", "")
-    steps, offset = (_numbers(path, header, rank, *n) for n in (_STEP_FIELDS, _OFFSET_FIELDS))
-    step, origin = (
-        float(values[3]) if rank == 4 and values is not None and math.isfinite(values[3]) else 0.0
-        for values in (steps, offset)
-    )
+    fields = (_numbers(path, header, rank, *names) for names in (_STEP_FIELDS, _OFFSET_FIELDS))
+    step, origin = (0.0 if n is None or rank < 4 else float(n[3]) for n in fields)
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
     return ImageInfo(
         unit=length_unit(header.get("DistanceUnits", "mm")),
         quantity="HU" if modality == "MET_MOD_CT" else None,
         channels=color_channels() if color else (),
         space="right-anterior-superior",
-        time_step=step if step > 0 else None,
-        time_origin=origin,
+        **time_fields(step, None, origin),
     )

@@ -153,9 +153,16 @@ def _source_fields(
 def _open_xml(path: str, key: str | None) -> VolumeSource:
     xml, appended = _read_xml(path)
     root = ElementTree.fromstring(xml)
-    image, piece = _image_and_piece(path, root)
-    affine, points = _xml_grid(path, image, piece)
-    arrays = _xml_arrays(root, piece)
+    image = root.find("ImageData")
+    if root.get("type") == "ImageData" and image is None:
+        raise ValueError(f"{path}: has no ImageData in it")
+    if root.tag != "VTKFile" or image is None:
+        raise ValueError(f"{path}: is not ImageData, but {root.get('type', root.tag)!r}")
+    pieces = image.findall("Piece")
+    if len(pieces) != 1:
+        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
+    affine, points = _xml_grid(path, image, pieces[0])
+    arrays = _xml_arrays(root, pieces[0])
     chosen, dropped = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
     if (number_dtype := number_type(array["kind"])) is None:
@@ -211,19 +218,6 @@ def _xml_grid(path: str, image: Any, piece: Any) -> tuple[np.ndarray, list[int]]
     affine[:3, :3] = direction * numbers("Spacing", "1 1 1")
     affine[:3, 3] = numbers("Origin", "0 0 0") + affine[:3, :3] @ low
     return affine, [b - a + 1 for a, b in zip(low, high, strict=True)]
-
-
-def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
-    """Returns the ImageData of a file, and its only piece."""
-    image = root.find("ImageData")
-    if root.get("type") == "ImageData" and image is None:
-        raise ValueError(f"{path}: has no ImageData in it")
-    if root.tag != "VTKFile" or image is None:
-        raise ValueError(f"{path}: is not ImageData, but {root.get('type', root.tag)!r}")
-    pieces = image.findall("Piece")
-    if len(pieces) != 1:
-        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
-    return image, pieces[0]
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
