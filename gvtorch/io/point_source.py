@@ -9,6 +9,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
@@ -160,6 +161,9 @@ def _sort(
     try:
         sort_points(source, folder=folder, **options)
     except BaseException:
-        shutil.rmtree(folder.parent.parent, ignore_errors=True)  # nothing else is there
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # not empty: another process is converting to it
+            folder.parent.rmdir()
+            folder.parent.parent.rmdir()
         raise
     write_json(record, identity_json)
