@@ -136,17 +136,16 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
         axis_order = named_axes(names, shape) if axes is None else None
         for axis, name in enumerate(names):
             sibling = Path(folder).parent / name
-            if sibling.parent != Path(folder).parent or name == "..":
-                continue  # the name of an axis must not be a path to another folder
-            is_other = name and sibling != Path(folder)
-            if is_other and (description := _describe_array(str(sibling))) is not None:
+            # The name of an axis must not be a path to another folder.
+            if sibling.parent != Path(folder).parent or name == ".." or sibling == Path(folder):
+                continue
+            if (description := _describe_array(str(sibling))) is not None:
                 coordinates, files = _open_array(description[0], str(sibling), source.opened)
                 if coordinates.shape == (shape[axis],) and shape[axis] < 1 << 24:
                     future = begin_read(coordinates, files)
                     values = Deadline(_READ_TIMEOUT).wait(future, str(sibling))
                     packing = _read_attributes(str(sibling))
-                    values = unpack_coordinates(values, packing)
-                    steps[axis] = even_steps(name, values, dropped)
+                    steps[axis] = even_steps(name, unpack_coordinates(values, packing), dropped)
                     units[axis] = str(packing.get("units", "")) or None
     axis_order = axis_order or ask_axes(path, shape, axes)
     placement, info_fields = axes_placement(axis_order, shape, steps, units)

@@ -197,12 +197,6 @@ def _check_settings(target: Path, settings: dict[str, Any]) -> None:
             )
 
 
-def count_done(target: Path) -> int:
-    """Returns the number of finished tasks in a target's journal."""
-    journal = target / WORK / JOURNAL
-    return journal.read_bytes().count(b"\n") if journal.exists() else 0
-
-
 def _write_journal_lines(journal: IO[str], done: Mapping[Task, TaskResult]) -> None:
     """Writes a line with a checksum for each task; they are on disk when this returns."""
     for task, result in done.items():
