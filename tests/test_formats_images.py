@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import tracemalloc
 import zlib
@@ -379,6 +380,25 @@ def test_other_vtk_files_are_named(tmp_path):
     (tmp_path / "a.vtk").write_bytes(b"# vtk DataFile Version 3.0\nt\nASCII\nDATASET POLYDATA\n\n")
     with pytest.raises(ValueError, match=r"POLYDATA.*expected STRUCTURED_POINTS"):
         gv.read_volume(tmp_path / "a.vtk")
+
+
+def test_raw_vti_of_more_values_than_fit_into_memory(tmp_path):
+    """A store holds 2^40 voxels; the file here is sparse."""
+    header = (
+        b'<VTKFile type="ImageData"><ImageData WholeExtent="0 4095 0 2047 0 2047">'
+        b'<Piece Extent="0 4095 0 2047 0 2047"><PointData><DataArray Name="a" type="UInt8" '
+        b'format="appended" offset="0"/></PointData></Piece></ImageData>'
+        b'<AppendedData encoding="raw">_'
+    )
+    file = tmp_path / "a.vti"
+    file.write_bytes(header)
+    os.truncate(file, len(header) + 4 + 2**34)
+    with file.open("r+b") as stream:
+        stream.seek(len(header) + 4 + 2**34 - 1)
+        stream.write(b"\7")
+    source = open_source(file)
+    assert source.extent == (4096, 2048, 2048)
+    assert source.read_region((2047, 2047, 4095), (2048, 2048, 4096)).item() == 7
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ nd2, because no library writes such files.
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -152,6 +153,18 @@ def test_lif(tmp_path, dtype):
         assert np.array_equal(gv.read_volume(file, key=key).data[..., 0].float(), other[0, 0, ::-1])
     with pytest.raises(ValueError, match="has no image 'big'; it holds 0 'cells', 1 'small'"):
         gv.read_volume(file, key="big")
+
+
+def test_lif_of_a_block_of_180_gb(tmp_path):
+    """A byte of its length equals the mark behind a length of four bytes; the file is sparse."""
+    data, length = noise((1, 1, 2, 5, 6)), 42 << 32
+    file = write_lif(tmp_path / "a.lif", {"cells": data})
+    content = file.read_bytes()
+    size = struct.pack("<Q", data.nbytes)
+    assert content.count(size) == 1
+    file.write_bytes(content.replace(size, struct.pack("<Q", length)))
+    os.truncate(file, len(content) - data.nbytes + length)
+    assert np.array_equal(open_source(file).read_times(0, 1)[0, ..., 0], data[0, 0, ::-1])
 
 
 def test_broken_lif_gives_one_line(tmp_path, five):

@@ -258,6 +258,17 @@ def test_a_broken_off_splat_goes_on(tmp_path, monkeypatch):
     assert total == pytest.approx(MASS.sum(), rel=1e-5)
 
 
+def test_a_splat_that_fails_leaves_what_another_process_has_in_the_folder(tmp_path):
+    lock = tmp_path / "a.zarr" / ".gvtorch-work" / "lock"
+    for begun in (False, True):
+        if begun:
+            lock.parent.mkdir(parents=True)
+            lock.touch()
+        with pytest.raises(ValueError, match="no point lies in the box"):
+            gv.splat(gv.Points(PLACE), tmp_path / "a.zarr", box=((1e6,) * 3, (2e6,) * 3))
+        assert lock.exists() == begun and (tmp_path / "a.zarr").exists() == begun
+
+
 def test_points_in_memory_go_to_worker_processes(tmp_path):
     store = gv.splat(gv.Points(PLACE, MASS), tmp_path / "a.zarr", extent=300, workers=2)
     total = store.read_region(0, (0, 0, 0), store.extent[::-1]).sum(dtype=np.float64)

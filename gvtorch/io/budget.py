@@ -63,18 +63,14 @@ def check_files(source: object) -> None:
 @contextmanager
 def header_budget(path: str) -> Iterator[None]:
     """Raises ValueError if the `with` block, which reads a header, exceeds the file's limits."""
-    try:
-        size = os.stat(path).st_size if os.path.isfile(path) else 0
-    except (OSError, ValueError):
-        size = 0
+    size = os.path.getsize(path) if os.path.isfile(path) else 0
     if not hasattr(time, "pthread_getcpuclockid"):
         yield
         return
     seconds = SECONDS + SECONDS_A_BYTE * size
     max_bytes = MEMORY + MEMORY_A_BYTE * size
-    watch = _Watch(seconds, max_bytes)
     try:
-        with watch:
+        with _Watch(seconds, max_bytes):
             yield
     except _OverBudget:
         raise ValueError(

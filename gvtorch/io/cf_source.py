@@ -53,9 +53,7 @@ class CfSource(VolumeSource):
 
 
 def cf_fields(dtype: np.dtype, attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the fields `packed`, `scale`, `missing`, `valid` and `stored` of a source, from dtype
-    and attributes of its array.
-    """
+    """Returns `packed`, `scale`, `missing`, `valid` and `stored` for the source of an array."""
     packed, unsigned = dtype, text_of(attributes.get("_Unsigned")).lower()
     is_integer, sign_stated = dtype.kind in "iu", unsigned in ("true", "false")
     if is_integer and sign_stated:
@@ -87,13 +85,8 @@ def cf_fields(dtype: np.dtype, attributes: Mapping[str, Any]) -> dict[str, Any]:
     stored = packed.str
     if scale or missing or valid != [-math.inf, math.inf]:
         stored = "float64" if packed.kind == "f" and packed.itemsize > 4 else "float32"
-    return {
-        "packed": packed.str,
-        "scale": scale,
-        "missing": missing,
-        "valid": tuple(valid),
-        "stored": stored,
-    }
+    fields = {"packed": packed.str, "scale": scale, "missing": missing, "stored": stored}
+    return {**fields, "valid": tuple(valid)}
 
 
 def unpack_coordinates(values: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:

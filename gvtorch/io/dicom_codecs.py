@@ -66,14 +66,10 @@ def decode_frame(packed: bytes, runner: Any) -> bytes:
     size = jpeg2k_size(packed) if codec == "jpeg2k" else jpeg_size(packed)
     if size != expected:
         raise ValueError(f"a frame is of {size} (columns, rows, samples), not of {expected}")
-    if codec == "jpeg":  # colours stay as they are stored: pydicom converts them
-        color_options: dict[str, Any] = (
-            {"colorspace": "YCBCR", "outcolorspace": "YCBCR"} if size[2] == 3 else {}
-        )
-        data = imagecodecs.jpeg_decode(packed, **color_options)
-    else:
-        data = getattr(imagecodecs, f"{codec}_decode")(packed)
-    data = np.asarray(data)
+    options: dict[str, Any] = {}
+    if codec == "jpeg" and size[2] == 3:  # colours stay as they are stored: pydicom converts them
+        options = {"colorspace": "YCBCR", "outcolorspace": "YCBCR"}
+    data = np.asarray(getattr(imagecodecs, f"{codec}_decode")(packed, **options))
     if data.size != size[0] * size[1] * size[2] or data.dtype.kind not in "iu":
         raise ValueError(f"a frame holds {data.shape} {data.dtype}")
     if codec == "jpeg2k" and size[2] == 3:

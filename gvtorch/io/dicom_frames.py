@@ -59,7 +59,7 @@ def frames_of(header: Any, count: int) -> list[DicomFrame]:
     per_frame = header.get("PerFrameFunctionalGroupsSequence") or ()
     if per_frame and len(per_frame) != count:
         raise ValueError(f"{header.filename}: declares {len(per_frame)} frames and holds {count}")
-    offsets = [float(v) for v in _floats(header.get("GridFrameOffsetVector"))]
+    offsets = _floats(header.get("GridFrameOffsetVector"))
     frames = []
     for number in range(count):
         groups = [g for g in (per_frame[number] if per_frame else None, shared) if g is not None]
@@ -137,19 +137,19 @@ def order_frames(path: str, frames: Sequence[DicomFrame]) -> Ordered:
                 "put those of one kind into a folder of their own"
             )
     rows, columns = _directions(path, first)
-    affine = np.eye(4)
+    affine, normal = np.eye(4), np.cross(rows, columns)
     affine[:3, 1], affine[:3, 2] = columns * first.spacing[0], rows * first.spacing[1]
     if any(frame.position is None for frame in frames):
-        return _order_by_number(frames, affine, np.cross(rows, columns))
-    slices = _group_by_position(frames, np.cross(rows, columns))
+        return _order_by_number(frames, affine, normal)
+    slices = _group_by_position(frames, normal)
     count, attribute = _sort_times(path, slices)
     ordered = [[slice_frames[t] for slice_frames in slices] for t in range(count)]
     positions = np.array([slice_frames[0].position for slice_frames in slices])
     affine[:3, 3] = positions[0]
-    affine[:3, 0] = np.cross(rows, columns) * (first.slice_spacing or 1.0)
+    affine[:3, 0] = normal * (first.slice_spacing or 1.0)
     dropped = []
     if len(slices) > 1:
-        affine[:3, 0] = _step(path, positions, np.cross(rows, columns))
+        affine[:3, 0] = _step(path, positions, normal)
     elif first.slice_spacing is None:
         dropped.append("how thick its only slice is: it is 1 thick here")
     if attribute is not None and attribute not in (*_TIME_UNITS, *_DISTINGUISHING[:2]):
@@ -165,9 +165,7 @@ def _directions(path: str, frame: DicomFrame) -> tuple[np.ndarray, np.ndarray]:
     rows, columns = orientation[:3], orientation[3:]
     lengths = np.linalg.norm(rows), np.linalg.norm(columns)
     if not np.allclose(lengths, 1, atol=1e-2) or abs(rows @ columns) > 1e-2:
-        raise ValueError(
-            f"{path}: Image Orientation {orientation.tolist()} is not a pair of directions"
-        )
+        raise ValueError(f"{path}: Image Orientation {orientation.tolist()} is not two directions")
     return rows / lengths[0], columns / lengths[1]
 
 
@@ -201,9 +199,7 @@ def _group_by_position(frames: Sequence[DicomFrame], normal: np.ndarray) -> list
 
 
 def _sort_times(path: str, slices: list[list[DicomFrame]]) -> tuple[int, str | None]:
-    """Sorts the frames of each slice by the attribute that distinguishes them; returns how many
-    they are, and its name.
-    """
+    """Sorts each slice's frames by what distinguishes them; returns their number, and its name."""
     counts = sorted({len(slice_frames) for slice_frames in slices})
     if counts == [1]:
         return 1, None
@@ -214,10 +210,8 @@ def _sort_times(path: str, slices: list[list[DicomFrame]]) -> tuple[int, str | N
         )
 
     def differs(name: str) -> bool:
-        return all(
-            len({f.attributes.get(name, 0.0) for f in slice_frames}) == counts[0]
-            for slice_frames in slices
-        )
+        values = ({f.attributes.get(name, 0.0) for f in slice_frames} for slice_frames in slices)
+        return all(len(distinct) == counts[0] for distinct in values)
 
     name = next(filter(differs, _DISTINGUISHING), None)
     if name is None:
@@ -259,11 +253,10 @@ def _step(path: str, positions: np.ndarray, normal: np.ndarray) -> np.ndarray:
             "resample them, or put those that are into a separate folder"
         )
     step: np.ndarray = (positions[-1] - positions[0]) / (len(positions) - 1)
-    deviation = positions - (positions[0] + np.arange(len(positions))[:, None] * step)
-    if np.abs(deviation).max() > max(0.05 * usual_gap, 1e-2):
-        raise ValueError(
-            f"{path}: slices do not lie on a line, by {np.abs(deviation).max():.4g} mm"
-        )
+    on_line = positions[0] + np.arange(len(positions))[:, None] * step
+    deviation = np.abs(positions - on_line).max()
+    if deviation > max(0.05 * usual_gap, 1e-2):
+        raise ValueError(f"{path}: slices do not lie on a line, by {deviation:.4g} mm")
     return step
 
 

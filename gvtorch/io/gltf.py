@@ -153,16 +153,13 @@ class _Plain:
             if transform:
                 u, v = (values * transform.get("scale", (1, 1))).T
                 angle = transform.get("rotation", 0.0)
-                turned = (
-                    np.cos(angle) * u + np.sin(angle) * v,
-                    np.cos(angle) * v - np.sin(angle) * u,
-                )
-                values = np.stack(turned, 1) + transform.get("offset", (0, 0))
+                cosine, sine = np.cos(angle), np.sin(angle)
+                turned = np.stack((cosine * u + sine * v, cosine * v - sine * u), 1)
+                values = turned + transform.get("offset", (0, 0))
             self._copies[key] = self._add(values.astype("<f4"), 5126)
         return self._copies[key]
 
     def _split_fan(self, primitive: dict[str, Any]) -> None:
-        """Replaces a fan by its triangles."""
         if "indices" in primitive:
             corners = self._values(primitive["indices"])[:, 0].astype("<u4")
         else:
@@ -175,18 +172,12 @@ class _Plain:
 
     def _add(self, values: np.ndarray, component: int) -> int:
         """Returns the number of a new accessor that holds `values`, (n, width)."""
-        view = {
-            "buffer": len(self.header["buffers"]),
-            "byteOffset": len(self.added),
-            "byteLength": values.nbytes,
-        }
+        buffers, views, accessors = (
+            self.header[name] for name in ("buffers", "bufferViews", "accessors")
+        )
+        place = {"byteOffset": len(self.added), "byteLength": values.nbytes}
+        kind = {"componentType": component, "type": _TYPES[values.shape[1]]}
         self.added += values.tobytes()
-        self.header["bufferViews"].append(view)
-        accessor = {
-            "bufferView": len(self.header["bufferViews"]) - 1,
-            "componentType": component,
-            "count": len(values),
-            "type": _TYPES[values.shape[1]],
-        }
-        self.header["accessors"].append(accessor)
-        return len(self.header["accessors"]) - 1
+        views.append({"buffer": len(buffers), **place})
+        accessors.append({"bufferView": len(views) - 1, "count": len(values), **kind})
+        return len(accessors) - 1

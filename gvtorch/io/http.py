@@ -100,17 +100,13 @@ def read_http(
     max_file_bytes = max_bytes if max_file_bytes is None else max_file_bytes
     try:
         return _read(url, max_bytes, byte_range, max_file_bytes, deadline)
-    except TimeoutError:
-        if seconds < max_seconds and time.monotonic() >= deadline:
-            raise
-        failure: OSError = Endless("the server sends hardly anything")
     except OSError as error:
-        failure = error
-    keep_reason(url, failure, REFUSED_SECONDS if isinstance(failure, Endless) else 0.0)
-    try:
-        raise failure from None
-    finally:
-        del failure  # its traceback holds this frame, and what was read
+        if isinstance(error, TimeoutError):
+            if seconds < max_seconds and time.monotonic() >= deadline:
+                raise
+            error = Endless("the server sends hardly anything")
+        keep_reason(url, error, REFUSED_SECONDS if isinstance(error, Endless) else 0.0)
+        raise error from None
 
 
 def keep_reason(url: str, error: OSError, seconds: float = 0.0) -> None:
@@ -217,9 +213,8 @@ def _read_content(
     # `read1` ends without an error where a server breaks off.
     if response.length and (stop is None or content_start + len(content) < stop):
         raise OSError(f"cut off: {response.length} bytes are missing")
-    wanted = (
-        content[start:] if start < 0 else content[: None if stop is None else stop - content_start]
-    )
+    end = None if stop is None else stop - content_start
+    wanted = content[start:] if start < 0 else content[:end]
     if len(wanted) > max_bytes:
         raise Endless(f"the server sends more than {max_bytes} bytes")
     return bytes(wanted)
@@ -253,9 +248,7 @@ def is_forbidden(error: OSError) -> bool:
 def _send_request(
     url: str, headers: dict[str, str], seconds: float
 ) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
-    """Sends a request; returns the connection (None if it is urllib's) and the answer, whose body
-    is not read yet.
-    """
+    """Returns a connection (None if it is urllib's), and the answer, whose body is not read yet."""
     url_parts = urllib.parse.urlsplit(_quoted(url))
     request_target = url_parts.path + (f"?{url_parts.query}" if url_parts.query else "")
     proxied = url_parts.scheme in urllib.request.getproxies()

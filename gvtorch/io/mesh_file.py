@@ -30,7 +30,6 @@ ENDINGS = ("obj", "ply", "stl", "gltf", "glb", "off")
 _MEMORY_PER_BYTE = 4  # bytes of memory that reading takes for each byte of a file, at least
 _MAX_TEXTURE_BYTES = 1500 * 10**6  # bytes of memory that decoding textures may take, for any file
 _TEXTURE_PER_BYTE = 100  # and for each byte of it and of the files that it refers to
-_MIN_FACE_BYTES = 1  # a triangle takes more bytes than this in any format
 
 
 def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
@@ -55,11 +54,13 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
     check.instance("read_mesh", "path", path, str, PathLike)
     check.instance("read_mesh", "texture", texture or "", str, PathLike)
     path = Path(path)
-    ending, packed = _ending(path)
+    ending = path.name.lower().removesuffix(".gz").rpartition(".")[2]
+    if ending not in ENDINGS:
+        raise ValueError(f"{path}: a mesh's name must end in {', '.join(ENDINGS)} (or .gz behind)")
     if not path.is_file():
         raise FileNotFoundError(f"file not found: {path}")
     trimesh = need_library(f"{path}: a mesh", "trimesh", extra="mesh")
-    content = _read_content(path, packed)
+    content = _read_content(path)
     _check_claims(path, ending, content)
     resolver: Any = _FolderResolver(path)
     try:
@@ -70,7 +71,9 @@ def read_mesh(path: str | Path, *, texture: str | Path | None = None) -> Mesh:
         options: Any = {"file_type": ending, "process": False, "allow_remote": False}
         loaded = trimesh.load(io.BytesIO(content), resolver=resolver, **options)
         _check_textures(_images(loaded), len(content) + resolver.size)
-        parts = _loaded_parts(trimesh, loaded)
+        # In a scene, `dump` applies the transforms.
+        parts = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
+        parts = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     except Exception as error:  # a damaged file may raise anything
         reason = resolver.problem or one_line(error)
         raise ValueError(f"{path}: can't be read as {ending}: {reason}") from error
@@ -97,35 +100,23 @@ def _with_texture(mesh: Mesh, texture: Path) -> Mesh:
             pixels = np.asarray(image.convert("RGBA"), np.uint8)
     except (OSError, ValueError, SyntaxError) as error:
         raise ValueError(f"{texture}: can't be read as an image: {error}") from None
-    materials = tuple(
-        Material(name=m.name, color=(1.0,) * 4, texture=pixels) for m in mesh.materials
-    )
-    return replace(mesh, materials=materials)
+    look = Material(color=(1.0, 1.0, 1.0, 1.0), texture=pixels)
+    return replace(mesh, materials=tuple(replace(look, name=m.name) for m in mesh.materials))
 
 
-def _ending(path: Path) -> tuple[str, bool]:
-    name = path.name.lower()
-    packed = name.endswith(".gz")
-    ending = name.removesuffix(".gz").rpartition(".")[2]
-    if ending not in ENDINGS:
-        raise ValueError(f"{path}: a mesh's name must end in {', '.join(ENDINGS)} (or .gz behind)")
-    return ending, packed
-
-
-def _read_content(path: Path, packed: bool) -> bytes:
-    max_bytes = memory_free() // _MEMORY_PER_BYTE
-    if not packed:
+def _read_content(path: Path) -> bytes:
+    if not path.name.lower().endswith(".gz"):
         check_memory(str(path), path.stat().st_size * _MEMORY_PER_BYTE)
         return path.read_bytes()
+    max_bytes = memory_free() // _MEMORY_PER_BYTE
     try:
         with gzip.open(path) as stream:
             content = stream.read(max_bytes + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise ValueError(f"{path}: can't be unpacked: {error}") from None
     if len(content) > max_bytes:
-        raise ValueError(
-            f"{path}: unpacks to more than {amount(max_bytes)}, what free memory can take"
-        )
+        limit = amount(max_bytes)
+        raise ValueError(f"{path}: unpacks to more than {limit}, what free memory can take")
     return content
 
 
@@ -144,9 +135,8 @@ def _check_textures(images: list[Any], size: int) -> None:
     needed_bytes = sum(sizes) + 2 * max(sizes, default=0)  # they are decoded one after another
     limit = min(_MAX_TEXTURE_BYTES + _TEXTURE_PER_BYTE * size, memory_free())
     if needed_bytes > limit:
-        raise ValueError(
-            f"its textures take {amount(needed_bytes)} of memory, at most {amount(limit)}"
-        )
+        needed = amount(needed_bytes)
+        raise ValueError(f"its textures take {needed} of memory, at most {amount(limit)}")
 
 
 def _parse_count(word: bytes) -> int:
@@ -155,26 +145,20 @@ def _parse_count(word: bytes) -> int:
 
 
 def _check_claims(path: Path, ending: str, content: bytes) -> None:
-    """Raises ValueError, before memory is allocated, if a header claims more triangles than the
-    file can hold, or than a mesh may have.
-    """
-    claimed = None
+    """Raises ValueError, before memory is allocated, if a header claims too many triangles."""
+    claimed = 0
     if ending == "stl" and len(content) >= 84 and not content[:5].lower() == b"solid":
         claimed = int.from_bytes(content[80:84], "little")
     if ending == "ply":
         for line in content[:65536].partition(b"end_header")[0].splitlines():
             tokens = line.split()
             if tokens[:2] in ([b"element", b"face"], [b"element", b"vertex"]) and len(tokens) == 3:
-                claimed = max(claimed or 0, _parse_count(tokens[2]))
+                claimed = max(claimed, _parse_count(tokens[2]))
     if ending == "off":
         numbers = content[:4096].split()[1:3]
-        claimed = max((_parse_count(n) for n in numbers if n.isdigit()), default=None)
-    if claimed is None:
-        return
-    if claimed > len(content) // _MIN_FACE_BYTES:
-        raise ValueError(
-            f"{path}: declares {claimed} triangles or vertices in {len(content)} bytes: damaged"
-        )
+        claimed = max(map(_parse_count, numbers), default=0)
+    if claimed > (size := len(content)):  # each takes more than a byte
+        raise ValueError(f"{path}: declares {claimed} triangles or vertices in {size} bytes")
     if claimed > MOST_FACES:
         raise ValueError(f"{path}: at most {MOST_FACES} triangles, it declares {claimed}")
 
@@ -220,13 +204,6 @@ class _FolderResolver:
         return self
 
 
-def _loaded_parts(trimesh: Any, loaded: Any) -> list[Any]:
-    """Returns the meshes that trimesh loaded, with the transforms of their scene applied."""
-    parts = loaded.dump(concatenate=False) if isinstance(loaded, trimesh.Scene) else [loaded]
-    parts = parts if isinstance(parts, list) else [parts]
-    return [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-
-
 def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh:
     """Joins trimesh's meshes. If not `mapped`, no image was read: images in them are trimesh's
     default, and are left out.
@@ -248,9 +225,8 @@ def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh
         vertex_count += len(part_vertices)
         visual = part.visual
         uv = getattr(visual, "uv", None)
-        uvs.append(
-            np.zeros((len(part_faces), 3, 2)) if uv is None else np.asarray(uv)[part_faces][..., :2]
-        )
+        uv_of_vertices = np.zeros((len(part_vertices), 2)) if uv is None else np.asarray(uv)
+        uvs.append(uv_of_vertices[part_faces][..., :2])
         material = getattr(visual, "material", None)
         colors.append(_colors(part, part_faces, ending))
         if colors[-1] is not None and _alpha_mode(material, ending) == "OPAQUE":
@@ -259,16 +235,14 @@ def _join_parts(path: Path, ending: str, parts: list[Any], mapped: bool) -> Mesh
             material_numbers[id(material)] = len(materials)
             materials.append(_material(path, material, ending, mapped and uv is not None))
         numbers.append(np.full(len(part_faces), material_numbers[id(material)]))
-    uncolored = all(color is None for color in colors)
-    filled_colors = [
-        np.ones((len(part_faces), 3, 4), np.float32) if color is None else color
-        for part_faces, color in zip(faces, colors, strict=True)
-    ]
+    is_colored = any(color is not None for color in colors)
+    white = [np.ones((*part.shape, 4), np.float32) for part in faces]
+    filled = [own if color is None else color for own, color in zip(white, colors, strict=True)]
     textured = mapped and any(getattr(p.visual, "uv", None) is not None for p in parts)
     return Mesh(
         vertices=np.concatenate(vertices),
         faces=np.concatenate(faces),
-        color=None if uncolored else np.concatenate(filled_colors),
+        color=np.concatenate(filled) if is_colored else None,
         uv=np.concatenate(uvs).astype(np.float32) if textured else None,
         material=np.concatenate(numbers),
         materials=tuple(materials),
@@ -321,18 +295,16 @@ def _alpha_mode(material: Any, ending: str) -> str:
 
 def _material(path: Path, material: Any, ending: str, mapped: bool) -> Material:
     """Converts a material of trimesh; white if there is none."""
-    if material is None:
-        return Material(color=(1.0, 1.0, 1.0, 1.0))
     is_gltf = ending in ("gltf", "glb")
-    if not is_gltf and not mapped and getattr(material, "image", None) is not None:
+    image = getattr(material, "baseColorTexture" if is_gltf else "image", None)
+    if material is None or (image is not None and not is_gltf and not mapped):
         return Material(color=(1.0, 1.0, 1.0, 1.0))
     base_color = getattr(material, "baseColorFactor", None) if is_gltf else material.main_color
-    image = getattr(material, "baseColorTexture" if is_gltf else "image", None)
-    color = np.ones(4) if base_color is None else np.asarray(base_color, np.float64)
-    if base_color is not None and np.asarray(base_color).dtype.kind in "ui":
-        color = color / 255
-    if image is not None and not is_gltf:
-        color = np.ones(4)  # the texture replaces the colour
+    if base_color is None or (image is not None and not is_gltf):
+        color = np.ones(4)  # a texture replaces the colour, except in glTF
+    else:
+        scale = 255 if np.asarray(base_color).dtype.kind in "ui" else 1
+        color = np.asarray(base_color, np.float64) / scale
     if ending == "obj":
         color[3] *= _opacity(material)
     if not is_gltf:

@@ -94,7 +94,6 @@ class MeshSource(VolumeSource):
         return sources
 
     def staged(self, folder: Path) -> MeshSource:
-        """Writes the mesh to a file in the folder."""
         if self.mesh is None:
             return self
         file, arrays = folder / "mesh.npz", _mesh_arrays(self.mesh)
@@ -102,7 +101,6 @@ class MeshSource(VolumeSource):
         return dataclasses.replace(self, mesh=None, file=str(file))
 
     def fingerprint(self) -> list[Any]:
-        """Returns values that identify the mesh, the channel and the settings."""
         settings = {**dict(self.settings), "solid": self.solid}
         return [*self.identity, self.channel, *settings.values()]
 
@@ -136,10 +134,7 @@ def voxelize(
     **settings: Unpack[GridSettings],
 ) -> Store:
     """Writes a mesh into a store, out of core: memory holds only the mesh and a few cubes of
-    voxels.
-
-    Large stores are written by worker processes; a script that calls this needs the usual
-    `if __name__ == "__main__":` around its work.
+    voxels. Large stores are written by worker processes, see `convert`.
 
     Args:
         mesh: A `Mesh`, or a file that `read_mesh` can read.

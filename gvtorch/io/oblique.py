@@ -61,12 +61,6 @@ class StraightSource(VolumeSource):
                 self._resample(values, start, box, out_values[z - low[0] : box[1][0] - low[0]])
         return out[..., index[4]]
 
-    def _inner_positions(self, low: Sequence[int], high: Sequence[int]) -> list[np.ndarray]:
-        """Returns positions z, y, x of a box in the inner source; the same bits for any box."""
-        z, y, x = np.ogrid[boxes.index(low, high)]
-        positions = [a * x + b * y + c * z + d for a, b, c, d in self.to_inner]
-        return positions[::-1]
-
     def _inner_box(self, low: Sequence[int], high: Sequence[int]) -> tuple[list[int], list[int]]:
         """Returns start and stop, z y x, of the inner voxels under a box; none if stop <= start."""
         ends = zip(low, np.subtract(high, 1), strict=True)
@@ -86,33 +80,27 @@ class StraightSource(VolumeSource):
         out: np.ndarray,
     ) -> None:
         """Writes a box (z, y, x, c) from inner values (z, y, x, c), of voxels from `start` on."""
-        positions = np.broadcast_arrays(*self._inner_positions(*box))
-        shape = self.inner.extent[::-1]
-        inside = np.logical_and.reduce(
-            [
-                (position >= -0.5 - _ROUNDING_VOXELS) & (position <= n - 0.5 + _ROUNDING_VOXELS)
-                for position, n in zip(positions, shape, strict=True)
-            ]
-        )
+        z, y, x = np.ogrid[boxes.index(*box)]
+        # Inner positions x, y, z: a voxel has the same bits in any box.
+        xyz = [a * x + b * y + c * z + d for a, b, c, d in self.to_inner]
+        positions = np.broadcast_arrays(*xyz[::-1])
+        pairs = list(zip(positions, self.inner.extent[::-1], strict=True))
+        inside = np.ones(positions[0].shape, bool)
+        for a, n in pairs:
+            inside &= (a >= -0.5 - _ROUNDING_VOXELS) & (a <= n - 0.5 + _ROUNDING_VOXELS)
         if not inside.any():
             return
-        inside_positions = [
-            position[inside].clip(0, n - 1) for position, n in zip(positions, shape, strict=True)
-        ]
+        places = [a[inside].clip(0, n - 1) for a, n in pairs]
         if self.nearest:
-            index = [
-                np.floor(a + 0.5).astype(np.int64) - s
-                for a, s in zip(inside_positions, start, strict=True)
-            ]
-            out[inside] = values[tuple(index)]
+            voxels = (np.floor(a + 0.5).astype(np.int64) for a in places)
+            out[inside] = values[tuple(v - s for v, s in zip(voxels, start, strict=True))]
             return
-        lows = [np.floor(a) for a in inside_positions]
-        total = np.zeros((len(inside_positions[0]), values.shape[3]))
+        sizes = values.shape[:3]
+        axes = [(a, np.floor(a), n, s) for a, n, s in zip(places, sizes, start, strict=True)]
+        total = np.zeros((len(places[0]), values.shape[3]))
         for corner in itertools.product((0, 1), repeat=3):
-            weight, index = np.ones(len(inside_positions[0])), []
-            for a, first, upper, n, s in zip(
-                inside_positions, lows, corner, values.shape, start, strict=False
-            ):
+            weight, index = np.ones(len(places[0])), []
+            for (a, first, n, s), upper in zip(axes, corner, strict=True):
                 weight = weight * (a - first if upper else 1 - (a - first))
                 position = (first + upper).astype(np.int64) - s
                 index.append(np.minimum(position, n - 1))  # voxels beyond have weight 0

@@ -48,9 +48,7 @@ def open_unpacked(
 
 
 class ZlibStream(io.RawIOBase):
-    """What an open file or an answer of a server unpacks to by zlib, or by gzip, from its position
-    on.
-    """
+    """What an open file or an answer unpacks to by zlib, or by gzip, from its position on."""
 
     def __init__(self, packed: io.BufferedIOBase) -> None:
         self._file, self._unpacker = packed, zlib.decompressobj(zlib.MAX_WBITS | 32)
@@ -83,9 +81,7 @@ def unpack_block(codec: str, packed: Any, needed_bytes: int) -> bytes:
     else:
         declared = int.from_bytes(packed[4:8], "little"), int.from_bytes(packed[12:16], "little")
         if codec == "blosc" and (len(packed) < 16 or declared != (needed_bytes, len(packed))):
-            raise ValueError(
-                f"a block of {needed_bytes} bytes expected, its header declares {declared[0]}"
-            )
+            raise ValueError(f"a block of {needed_bytes} bytes expected, {declared[0]} declared")
         codecs = need_library(f"what is packed by {codec}", "imagecodecs")
         unpacked = bytes(getattr(codecs, f"{codec}_decode")(bytes(packed), out=needed_bytes))
     if len(unpacked) != needed_bytes:
@@ -119,7 +115,5 @@ def blosc_begin(packed: bytes, count: int) -> bytes:
             f"a packed part begins with a block of {block} bytes at byte {start}; expected {count} "
             f"to {_MAX_BLOCK_BYTES} bytes, within {len(packed)}"
         )
-    header = struct.pack("<3I", block, block, 20 + len(packed) - start)
-    return unpack_block(
-        "blosc", packed[:4] + header + struct.pack("<I", 20) + packed[start:], block
-    )
+    header = struct.pack("<4I", block, block, 20 + len(packed) - start, 20)
+    return unpack_block("blosc", packed[:4] + header + packed[start:], block)

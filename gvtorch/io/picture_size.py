@@ -138,8 +138,10 @@ def _jpegxr_size(packed: bytes) -> tuple[int, int] | None:
 
 def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
     """Returns (columns, rows); None for animations, and for images with a preview before them."""
-    if packed[4:8] == b"JXL ":
-        packed = b"".join(_jpegxl_parts(packed))[:_JXL_HEADER_BYTES]
+    if packed[4:8] == b"JXL ":  # the codestream: whole (jxlc), or in parts after a number (jxlp)
+        skipped = {b"jxlc": 0, b"jxlp": 4}
+        boxes = ((a + skipped[k], b) for a, b, k in _boxes(packed) if k in skipped)
+        packed = b"".join(packed[start:end] for start, end in boxes)[:_JXL_HEADER_BYTES]
     if packed[:2] != b"\xff\x0a" or len(packed) < 14:
         return None
     bits = int.from_bytes(packed[2:_JXL_HEADER_BYTES], "little")
@@ -164,13 +166,6 @@ def _jpegxl_size(packed: bytes) -> tuple[int, int] | None:
         if take(2):  # a preview, an animation
             return None
     return dimensions
-
-
-def _jpegxl_parts(packed: bytes) -> Iterator[bytes]:
-    """Yields the codestream: whole (jxlc), or in parts (jxlp), without the number before each."""
-    for start, end, kind in _boxes(packed):
-        if kind in (b"jxlc", b"jxlp"):
-            yield packed[start + 4 * (kind == b"jxlp") : end]
 
 
 _READERS: dict[bytes, Callable[[bytes], tuple[int, int] | None]] = {

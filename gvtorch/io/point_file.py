@@ -28,10 +28,14 @@ from .source import convert_errors, number_type
 
 ENDINGS = ("npz", "ply", "fits", "fit", "fits.gz")
 _ALL_POINTS = 2**62
-_POSITION_NAMES = ("position", "pos", "xyz", "points", "coord")
 _VALUE_NAMES = ("value", "mass", "lumin", "intensit", "weight", "flux", "bright", "densit")
-_COLOR_NAMES = ("color", "colour", "rgb")
-_RADIUS_NAMES = ("radius", "radii", "smoothing")
+#: Usual names: of several columns, or how that of a single one begins, and its numbers per row.
+_USUAL: dict[str, tuple[tuple[str, ...], tuple[str, ...], tuple[int, ...]]] = {
+    "positions": (("x y z",), ("position", "pos", "xyz", "points", "coord"), (3,)),
+    "colors": (("red green blue", "r g b"), ("color", "colour", "rgb"), (3, 4)),
+    "values": ((), _VALUE_NAMES, (1, 2, 3, 4)),
+    "radius": ((), ("radius", "radii", "smoothing"), (1,)),
+}
 _FITS_TYPES = tuple("BIJKEDF")  # codes of columns with a number or an array of numbers per row
 _MAX_HEADER_BYTES = 65536
 
@@ -76,11 +80,13 @@ class PointFile:
             with convert_errors(ValueError, str(self.path), "can't be read"):
                 fields = {name: self._join_columns(used, part) for name, used in self.used.items()}
                 if "colors" in fields:
+                    colors = fields["colors"][:, :3]
                     dtypes = {self.columns[name].dtype for name in self.used["colors"]}
-                    fields["colors"] = _linear_colors(fields["colors"][:, :3], dtypes)
+                    if all(dtype.kind in "iu" for dtype in dtypes):  # whole numbers are sRGB
+                        colors = array_from_srgb(colors / max(np.iinfo(d).max for d in dtypes))
+                    fields["colors"] = colors
                 radius = fields["radius"][:, 0] if "radius" in fields else self._constant
-                values, colors = fields.get("values"), fields.get("colors")
-                yield Points(fields["positions"], values, colors, radius)
+                yield Points(**{**fields, "radius": radius})
 
     def _join_columns(self, names: Sequence[str], part: slice) -> np.ndarray:
         columns = (np.asarray(self.columns[name][part]) for name in names)
@@ -128,7 +134,7 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     if not count:
         raise ValueError(f"{path}: holds no columns of numbers")
     # Columns of other names may have any length.
-    usual_names = _POSITION_NAMES + _COLOR_NAMES + _VALUE_NAMES + _RADIUS_NAMES
+    usual_names = tuple(itertools.chain(*(beginnings for _, beginnings, _ in _USUAL.values())))
     other_lengths = [
         f"{name} ({len(column)})"
         for name, column in columns.items()
@@ -222,9 +228,7 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
 
 
 def _text_column(name: str, values: np.ndarray, kind: str) -> np.ndarray:
-    """Returns the float64 values of a column in its dtype; raises ValueError if an integer is not
-    whole, or out of range.
-    """
+    """Returns float64 values in a column's dtype; raises ValueError if an integer does not fit."""
     with np.errstate(all="ignore"):
         column: np.ndarray = values.astype(kind)
     if column.dtype.kind in "iu" and (column != values).any():
@@ -276,47 +280,24 @@ def _choose_columns(
             if name not in columns:
                 raise ValueError(f"{path}: has no column {name!r}; it has {', '.join(columns)}")
 
-    def choose_by_prefix(role: str, prefixes: Sequence[str], allowed_widths: Sequence[int]) -> None:
-        matches = [
-            name
-            for lower_name, name in by_lower_name.items()
-            if lower_name.startswith(tuple(prefixes)) and widths[name] in allowed_widths
-        ]
-        if len(matches) > 1:
+    for role, (groups, beginnings, sizes) in _USUAL.items():
+        if role in chosen or (role == "radius" and names.get(role) is not None):
+            continue
+        group = next((g.split() for g in groups if singles.keys() >= {*g.split()}), None)
+        begins = [name for lower, name in by_lower_name.items() if lower.startswith(beginnings)]
+        matches = [name for name in begins if widths[name] in sizes]
+        if group is None and len(matches) > 1:
             raise ValueError(
                 f"{path}: {' or '.join(matches)} may be its {role}: say which, as in "
                 f"{role}={matches[0]}"
             )
-        if matches:
-            chosen[role] = matches
-
-    def choose_several(role: str, *groups: str) -> bool:
-        for group in map(str.split, groups):
-            if singles.keys() >= set(group):
-                chosen[role] = [singles[name] for name in group]
-                return True
-        return False
-
-    if "positions" not in chosen and not choose_several("positions", "x y z"):
-        choose_by_prefix("positions", _POSITION_NAMES, [3])
-    if "positions" not in chosen:
-        listed = ", ".join(f"{name} ({width})" for name, width in widths.items())
-        raise ValueError(f"{path}: which columns are positions? It has {listed}")
-    if "colors" not in chosen and not choose_several("colors", "red green blue", "r g b"):
-        choose_by_prefix("colors", _COLOR_NAMES, [3, 4])
-    if "values" not in chosen:
-        choose_by_prefix("values", _VALUE_NAMES, [1, 2, 3, 4])
-    if names.get("radius") is None:
-        choose_by_prefix("radius", _RADIUS_NAMES, [1])
-    for role, sizes in (("positions", (3,)), ("colors", (3, 4)), ("radius", (1,))):
-        total = sum(widths[name] for name in chosen.get(role, ()))
-        if role in chosen and total not in sizes:
+        if group or matches:
+            chosen[role] = [singles[name] for name in group] if group else matches
+        if "positions" not in chosen:
+            listed = ", ".join(f"{name} ({width})" for name, width in widths.items())
+            raise ValueError(f"{path}: which columns are positions? It has {listed}")
+    for role, used in chosen.items():
+        sizes, total = _USUAL[role][2], sum(widths[name] for name in used)
+        if role != "values" and total not in sizes:
             raise ValueError(f"{path}: {role} must be {sizes[0]} numbers, the columns are {total}")
     return chosen
-
-
-def _linear_colors(colors: np.ndarray, dtypes: set[Any]) -> np.ndarray:
-    """Converts whole numbers, which are sRGB, to linear colours; others are linear already."""
-    if not all(column_dtype.kind in "iu" for column_dtype in dtypes):
-        return colors
-    return array_from_srgb(colors / max(np.iinfo(column_dtype).max for column_dtype in dtypes))

@@ -9,6 +9,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
@@ -60,7 +61,6 @@ class SplatSource(VolumeSource):
         )
 
     def fingerprint(self) -> list[Any]:
-        """Returns values that identify the points and the settings."""
         return list(self.identity)
 
     def read_stored(self, index: Index) -> np.ndarray:
@@ -105,10 +105,8 @@ def splat(
     **names: Unpack[ColumnNames],
 ) -> Store:
     """Writes points into a store, out of core: they are sorted on disk, in the folder of the
-    unfinished store, and read from there part by part.
-
-    Large stores are written by worker processes; a script that calls this needs the usual
-    `if __name__ == "__main__":` around its work.
+    unfinished store, and read from there part by part. Large stores are written by worker
+    processes, see `convert`.
 
     Args:
         points: A file as in `read_points`, or `Points`.
@@ -129,14 +127,18 @@ def splat(
     target = Path(store)
     check.one_of("splat", "channel", channel, CHANNELS)
     begun = is_begun(target, resume=resume)
-    source: Any = points if isinstance(points, Points) else PointFile(points, **names)
+    source: Any = points
+    if isinstance(points, Points):
+        columns = (points.positions, points.values, points.colors, points.radius)
+        path, version = "points", [len(points), checksum(c for c in columns if c is not None)]
+    else:
+        source, path, version = PointFile(points, **names), str(points), fingerprint(points)
     settings = {"extent": extent, "box": box, "channel": channel}
-    identity: list[Any] = [_points_identity(points), {**settings, "opacity": opacity, **names}]
+    identity: list[Any] = [version, {**settings, "opacity": opacity, **names}]
     if channel == "color":
         source = _LitPoints(source, check.number("splat", "opacity", opacity, low=0, high=1))
     folder = target / WORK / "points"
     _sort(source, folder, identity, begun, extent=extent, box=box, memory=memory, progress=progress)
-    path = "points" if isinstance(points, Points) else str(points)
     volume = SplatSource.of(folder, channel, path=path, identity=tuple(identity))
     options: dict[str, Any] = {"block": block, "executor": executor, "workers": workers}
     return convert(volume, target, resume=resume, progress=progress, **options)
@@ -159,14 +161,9 @@ def _sort(
     try:
         sort_points(source, folder=folder, **options)
     except BaseException:
-        shutil.rmtree(folder.parent.parent, ignore_errors=True)  # nothing else is there
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # not empty: another process is converting to it
+            folder.parent.rmdir()
+            folder.parent.parent.rmdir()
         raise
     write_json(record, identity_json)
-
-
-def _points_identity(points: str | Path | Points) -> list[Any]:
-    """Returns values that identify points: equal while these are unchanged."""
-    if not isinstance(points, Points):
-        return fingerprint(points)
-    columns = (points.positions, points.values, points.colors, points.radius)
-    return [len(points), checksum(column for column in columns if column is not None)]

@@ -4,6 +4,7 @@ right, `cut_polygons` polygons that are not convex, of which it would make a fan
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections import defaultdict
 from functools import partial
@@ -138,17 +139,14 @@ def ears(flat: np.ndarray) -> list[list[int]]:
         polygon = flat[remaining]
         turn = _turns(polygon)
         not_convex = polygon[turn <= _STRAIGHT_TURN]
-        ear = next(
-            (n for n in np.argsort(-turn) if _is_ear(polygon, int(n), turn[n], not_convex)), None
-        )
-        if ear is None:
+        order = np.argsort(-turn).tolist()
+        n = next((n for n in order if _is_ear(polygon, n, turn[n], not_convex)), None)
+        if n is None:
             break
-        n = int(ear)
         triangles.append([remaining[n - 1], remaining[n], remaining[(n + 1) % len(remaining)]])
         del remaining[n]
-    return triangles + [
-        [remaining[0], remaining[n], remaining[n + 1]] for n in range(1, len(remaining) - 1)
-    ]
+    first, *others = remaining
+    return triangles + [[first, a, b] for a, b in itertools.pairwise(others)]
 
 
 def _is_ear(polygon: np.ndarray, corner: int, turn: float, not_convex: np.ndarray) -> bool:

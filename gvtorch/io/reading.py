@@ -164,9 +164,7 @@ def open_source(
 def _find_opener(
     path: Any, arguments: dict[str, Any]
 ) -> tuple[str, str, Callable[..., VolumeSource]]:
-    """Returns a volume's name in messages, its format, and its opener; may add `key` to
-    `arguments`.
-    """
+    """Returns a volume's name in messages, its format, and its opener; may add `key`."""
     if not isinstance(path, (str, PathLike)):
         text, kind = "array", "an array"
         opener: Callable[..., VolumeSource] = partial(as_source, "read_volume", path)

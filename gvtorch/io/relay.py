@@ -106,12 +106,11 @@ class Relayed:
         max_file_bytes = max_part_bytes = max_bytes = _MAX_METADATA_BYTES
         if files is not None:
             max_file_bytes = max_bytes = files.max_bytes
-            max_part_bytes = max(
-                2 * files.chunk_bytes + EXTRA_BYTES + _MAX_JOINED_BYTES, files.index_bytes
-            )
+            joined_bytes = 2 * files.chunk_bytes + EXTRA_BYTES + _MAX_JOINED_BYTES
+            max_part_bytes = min(max(joined_bytes, files.index_bytes), max_file_bytes)
         if byte_range is not None:
-            max_bytes = range_bytes(byte_range, min(max_part_bytes, max_file_bytes))
-            if not 0 < max_bytes <= min(max_part_bytes, max_file_bytes):
+            max_bytes = range_bytes(byte_range, max_part_bytes)
+            if not 0 < max_bytes <= max_part_bytes:
                 raise Endless(f"{max_bytes} bytes are asked for, more than a chunk has")
         url = file_url(self.url, name)
         if is_http(url):
@@ -205,15 +204,6 @@ class _Server(http.server.ThreadingHTTPServer):
         self.folders: list[Relayed] = []
         threading.Thread(target=self.serve_forever, daemon=True, name="gvtorch-relay").start()
 
-    def folder(self, url: str, context: Any) -> Relayed:
-        """Returns the relayed folder of a URL, the same one for the same URL."""
-        for folder in self.folders:
-            if folder.url == url:
-                return folder
-        base = f"http://127.0.0.1:{self.server_port}/{self.secret}/{len(self.folders)}/"
-        self.folders.append(Relayed(url, base, context))
-        return self.folders[-1]
-
     def handle_error(self, *_: object) -> None:
         """Prints nothing: errors are normal when tensorstore gives up a request."""
 
@@ -295,9 +285,17 @@ _starting = threading.Lock()
 
 
 def relay_folder(url: str, context: Any = None) -> Relayed:
-    """Returns the relayed folder of a URL; `context` is tensorstore's, for s3:// and gs://."""
+    """Returns the relayed folder of a URL, the same one for the same URL; `context` is
+    tensorstore's, for s3:// and gs://.
+    """
     with _starting:
-        return _server().folder(url, context)
+        server = _server()
+        for folder in server.folders:
+            if folder.url == url:
+                return folder
+        base = f"http://127.0.0.1:{server.server_port}/{server.secret}/{len(server.folders)}/"
+        server.folders.append(Relayed(url, base, context))
+        return server.folders[-1]
 
 
 def with_urls(text: str) -> str:

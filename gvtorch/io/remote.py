@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import IO, Any
 from urllib.parse import unquote, urlsplit
 
-from ..base.digits import whole_number
+from ..base.digits import finite_number, whole_number
 from ..base.messages import need_library, one_line
 from ..base.whole_file import cache_folder, write_text
 from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib, unpacked
@@ -45,21 +45,16 @@ def is_file_url(text: str) -> bool:
     """Returns whether a URL is of a file, with a file's ending, and not of a Zarr or N5 folder."""
     if not re.match(r"[a-z0-9+]{2,}://", text) or text.startswith("file://"):
         return False
-    name = _file_name(text)
-    ending = re.search(r"\.([A-Za-z]\w*)$", name)
-    return (
-        ending is not None and ending[1].lower() not in _FOLDER_ENDINGS and not text.endswith("/")
-    )
+    ending = re.search(r"\.([A-Za-z]\w*)$", _file_name(text))
+    is_file = ending is not None and ending[1].lower() not in _FOLDER_ENDINGS
+    return is_file and not text.endswith("/")
 
 
 def cache_limit() -> int:
     """Returns the most bytes that the cache may hold."""
     text = os.environ.get("GVTORCH_CACHE_GB", "50")
-    try:
-        limit = float(text)
-    except ValueError:
-        limit = -1.0
-    if not 0 < limit < 1e6:
+    limit = finite_number(text)
+    if limit is None or not 0 < limit < 1e6:
         raise ValueError(f"GVTORCH_CACHE_GB must be gigabytes, got {text!r}")
     return int(limit * 1e9)
 

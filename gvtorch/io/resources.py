@@ -95,9 +95,7 @@ def begin_worker() -> None:
 def run_ahead(
     pool: Executor, task: Callable[[Item], Result], items: Iterable[Item], ahead: int
 ) -> Generator[Result, None, None]:
-    """Runs a task for each item, at most `ahead` at a time, and yields their results in the order
-    in which they finish.
-    """
+    """Runs a task for each item, at most `ahead` at a time; yields the results as they finish."""
     remaining, running = iter(items), set[Future[Result]]()
     try:
         while True:

@@ -34,16 +34,12 @@ Index = tuple[slice, ...]
 Triple = tuple[float, float, float]
 FileMetadata = tuple[ImageInfo, Triple, list[str]]  # info, spacing, metadata that is not kept
 _PART_BYTES = 1 << 20  # bytes that are unpacked at a time
-_INTEGER_NAMES = {
-    1: ("char", "int8"),
-    2: ("short", "int16"),
-    4: ("int", "int32"),
-    8: ("longlong", "int64"),
-}
+_INTEGERS = {"char": "i1", "short": "i2", "int": "i4", "longlong": "i8"}
+_INTEGERS |= {"int8": "i1", "int16": "i2", "int32": "i4", "int64": "i8"}
 _DTYPE_CODES = {
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
-    **{name: f"i{size}" for size, names in _INTEGER_NAMES.items() for name in names},
-    **{f"u{name}": f"u{size}" for size, names in _INTEGER_NAMES.items() for name in names},
+    **_INTEGERS,
+    **{f"u{name}": code.replace("i", "u") for name, code in _INTEGERS.items()},
 }
 _C_INTEGER = re.compile(
     r"(?:(?P<un>un)?signed )?(?:(?P<any>char|int)|(?P<long>short|longlong)(?: int)?)"
@@ -125,10 +121,6 @@ class VolumeSource(ABC):
         """Returns values that change with the content; None if the files at `path` identify it."""
         return None
 
-    def covers(self, index: Index) -> bool:
-        """Returns whether an index covers the whole array."""
-        return all(s.stop - s.start == n for s, n in zip(index, self.shape, strict=True))
-
     def check_file(self) -> None:  # noqa: B027, most formats find out when they read
         """Raises ValueError if the file is evidently too short, without reading it."""
 
@@ -157,9 +149,7 @@ class VolumeSource(ABC):
     def read_box(
         self, low: Sequence[int], high: Sequence[int], times: tuple[int, int]
     ) -> np.ndarray:
-        """Reads or maps a box of time points, (t, z, y, x, c) of `dtype`; damaged files may raise
-        anything.
-        """
+        """Reads or maps a box of time points, (t, z, y, x, c) of `dtype`; may raise anything."""
         index, spans = [], dict(zip("tzyx", (times, *zip(low, high, strict=True)), strict=True))
         for axis, size in zip(self.axes, self.shape, strict=True):
             start, stop = spans.get(axis, (0, size))
@@ -188,18 +178,14 @@ class ArraySource(VolumeSource):
     exact: bool = False  # nothing may follow the array
 
     def check_file(self) -> None:
-        """Compares the file's size with what the array takes."""
         if not self.whole:
             self._check_size(os.stat(self.file).st_size - self.offset)
 
     def read_stored(self, index: Index) -> np.ndarray:
-        """Maps the file, or unpacks it."""
         order: Any = "F" if self.fortran else "C"
         if not self.whole:
-            data: np.ndarray = np.memmap(
-                self.file, np.dtype(self.stored), "r", self.offset, self.shape, order
-            )
-            return data[index]
+            dtype = np.dtype(self.stored)
+            return np.memmap(self.file, dtype, "r", self.offset, self.shape, order)[index]
         content, size = np.empty(self._expected_bytes + self.exact, np.uint8), 0
         with open_unpacked(self.file, self.member, self.codec, self.start) as stream:
             stream.read(self.offset)
@@ -236,7 +222,6 @@ class MemorySource(VolumeSource):
         return cls(data=data, shape=data.shape, axes=axes, stored=data.dtype.str, **fields)
 
     def staged(self, folder: Path) -> VolumeSource:
-        """Writes the values to a file in the folder."""
         file = folder / "source.npy"
         with name_in_errors(file):
             save_npy(file, self.data)
@@ -265,13 +250,15 @@ def microscope_info(
     """Returns an image's info: its channels, if there is one for each of the `width` numbers of a
     voxel; the time step and its unit, if the step is positive.
     """
+    fitting = tuple(channels) if len(channels) == width else ()
+    return ImageInfo(unit=unit, channels=fitting, **time_fields(step, step_unit))
+
+
+def time_fields(step: float | None, unit: str | None, origin: float = 0.0) -> dict[str, Any]:
+    """Returns time_step, time_unit and time_origin of an `ImageInfo`, as far as they are usable."""
     has_step = step is not None and 0 < step < math.inf
-    return ImageInfo(
-        unit=unit,
-        channels=tuple(channels) if len(channels) == width else (),
-        time_step=step if has_step else None,
-        time_unit=step_unit if has_step else None,
-    )
+    known: dict[str, Any] = {"time_step": step, "time_unit": unit} if has_step else {}
+    return known | {"time_origin": origin if math.isfinite(origin) else 0.0}
 
 
 def read_planes(
@@ -358,9 +345,8 @@ def number_type(name: str) -> str | None:
 def check_time(context: str, time: object, times: int) -> None:
     """Raises ValueError if there is no such time point."""
     if type(time) is not int or not 0 <= time < times:
-        available = (
-            "1 time point, which is 0" if times == 1 else f"{times} time points, 0 to {times - 1}"
-        )
+        several = f"{times} time points, 0 to {times - 1}"
+        available = several if times > 1 else "1 time point, which is 0"
         raise ValueError(f"{context}: has no time {time!r}; it has {available}")
 
 

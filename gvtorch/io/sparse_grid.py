@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base import boxes
-from ..base.boxes import check_extent
 from ..base.image_info import ChannelInfo, ImageInfo
 from .source import Index, VolumeSource, place_axes
 
@@ -120,9 +119,8 @@ class SparseGrid(ABC):
         tile_groups = [(SIDES[0], self.root_origins[self._is_foreground(self.root_values)])]
         for level in (0, 1):
             for number in range(len(self.origins[level])):
-                tile_groups.append(
-                    (SIDES[level + 1], self._visible_tiles(level, number, *everywhere)[0])
-                )
+                tiles, _ = self._visible_tiles(level, number, *everywhere)
+                tile_groups.append((SIDES[level + 1], tiles))
         for side, origins in tile_groups:
             low.append(origins)
             high.append(origins + side)
@@ -224,7 +222,6 @@ class SparseSource(VolumeSource):
         size = [int(n) for n in high - low]
         if min(size) < 1 or np.abs((low, high)).max() > MAX_INDEX:
             raise ValueError(f"{path}: grid {name!r} has no active voxel")
-        check_extent(path, size, max_values=1 << 62)
         shifted = affine.astype(np.float64)
         shifted[:3, 3] += shifted[:3, :3] @ low
         shape = (*size, width) if width > 1 else tuple(size)
@@ -259,6 +256,5 @@ class SparseSource(VolumeSource):
 
 def bits(data: Any, offset: int, count: int) -> np.ndarray:
     """Returns (count,) bool, the bits of a mask at byte `offset`, a byte's lowest bit first."""
-    return np.unpackbits(np.frombuffer(data, "u1", count // 8, offset), bitorder="little").view(
-        bool
-    )
+    packed = np.frombuffer(data, "u1", count // 8, offset)
+    return np.unpackbits(packed, bitorder="little").view(bool)

@@ -107,7 +107,8 @@ def export_surface(
     path = Path(path)
     check_surface_path("export_surface", path)
     grid = _Grid(what, value, level, component, channel, caps)
-    with SurfaceFile(path, grid.to_world(np.zeros((1, 3)))[0], float(grid.step.min())) as file:
+    origin, step = grid.to_world(np.zeros((1, 3)))[0], float(grid.step.min())
+    with SurfaceFile(path, origin, step).opened() as file:
         for vertices, faces in _surface_parts(grid, progress):
             file.add(vertices, faces)
         if not file.triangles:
@@ -198,12 +199,10 @@ class _Grid:
         """Returns whether samples low to high may lie on both sides of the value: judged by the
         cells of a store, without reading voxels; true if there are no cells.
         """
-        store = self.source
-        outside = self.margin and any(
-            a == 0 or b == n for a, b, n in zip(low, high, self.samples, strict=True)
-        )
+        store, ends = self.source, zip(low, high, self.samples, strict=True)
         if not isinstance(store, Store) or not store.has_blocks:
             return True
+        outside = self.margin and any(a == 0 or b == n for a, b, n in ends)
         begin, end = ([n - self.margin for n in corner] for corner in (low, high))
         start, stop = clamped_box(begin, end, self.voxels)
         first, last = [n // CELL for n in start], [-(-n // CELL) for n in stop]
@@ -221,9 +220,8 @@ class _Grid:
 
 def _stored_label(label: float, label_values: torch.Tensor | None) -> int:
     """Returns the number by which a label is stored: its index in `label_values`, or itself."""
-    value = check.integer(
-        "extract_surface", "value of labels", int(label) if label % 1 == 0 else label, low=0
-    )
+    whole = int(label) if label % 1 == 0 else label
+    value = check.integer("extract_surface", "value of labels", whole, low=0)
     if label_values is None:
         return value
     matches = (label_values == value).nonzero()
@@ -245,10 +243,8 @@ def _surface_parts(grid: _Grid, progress: Progress) -> Iterator[tuple[np.ndarray
         low = tuple(_BLOCK_CELLS * n for n in block_index)
         high = tuple(min(a + _BLOCK_CELLS, n) for a, n in zip(low, last_cells, strict=True))
         z, y, x = block_index
-        neighbours = [
-            far_vertices.get(index) for index in ((z, y, x - 1), (z, y - 1, x), (z - 1, y, x))
-        ]
-        far_vertices.pop((z - 1, y, x), None)
+        near, behind = ((z, y, x - 1), (z, y - 1, x)), (z - 1, y, x)
+        neighbours = [*(far_vertices.get(n) for n in near), far_vertices.pop(behind, None)]
         end = [b + 1 for b in high]
         if grid.may_cross(low, end):
             piece = contour(grid.read(low, end), grid.value, low, grid.samples)

@@ -13,9 +13,10 @@ import json
 import shutil
 import struct
 import tempfile
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -28,9 +29,7 @@ _CHUNK_ALIGNMENT = 4  # chunks of a .glb end at multiples of this
 
 
 def check_surface_path(context: str, path: Path) -> None:
-    """Raises ValueError unless a surface may be written there, FileNotFoundError if there is no
-    such folder.
-    """
+    """Raises ValueError or FileNotFoundError unless a surface may be written there."""
     if path.suffix not in ENDINGS:
         raise ValueError(f"{context}: path must end in {' or '.join(ENDINGS)}, got {str(path)!r}")
     if not path.parent.is_dir():
@@ -40,7 +39,7 @@ def check_surface_path(context: str, path: Path) -> None:
 class SurfaceFile:
     """A file of triangles that appears once it is complete:
 
-    with SurfaceFile(path, origin, step) as file:
+    with SurfaceFile(path, origin, step).opened() as file:
         file.add(vertices, faces)
 
     Attributes:
@@ -52,37 +51,30 @@ class SurfaceFile:
         """Describes the file: a .ply holds world positions, float32 if that resolves a thousandth
         of `step`, else float64; a .glb holds float32 relative to `origin`, its translation.
         """
-        check_surface_path("surface", path)
         self._path, self._origin = path, origin
         self._is_glb, self._step = path.suffix == ".glb", step
         self.vertices = self.triangles = 0
         self._bounds = np.array([[np.inf] * 3, [-np.inf] * 3])
-        self._stack = ExitStack()
 
-    def __enter__(self) -> SurfaceFile:
-        """Opens the temporary files and returns itself."""
-        self._temporary_path = self._stack.enter_context(whole_file(self._path))
-        self._vertex_file, self._face_file = (
-            self._stack.enter_context(tempfile.TemporaryFile(dir=self._path.parent))
-            for _ in range(2)
-        )
-        self._stack.push(self._write)
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        """Writes the file; after an error, removes what there is of it."""
-        self._stack.__exit__(*error)
+    @contextmanager
+    def opened(self) -> Iterator[SurfaceFile]:
+        """Yields itself; writes the file at the end, or nothing after an error."""
+        folder = self._path.parent
+        with (
+            whole_file(self._path) as draft,
+            tempfile.TemporaryFile(dir=folder) as self._vertex_file,
+            tempfile.TemporaryFile(dir=folder) as self._face_file,
+        ):
+            yield self
+            with draft.open("wb") as file:
+                (self._write_glb if self._is_glb else self._write_ply)(file)
 
     def add(self, positions: np.ndarray, faces: np.ndarray) -> None:
-        """Appends vertices, (v, 3) float64 world x y z, and triangles, (f, 3) indices of all
-        vertices added so far.
-        """
+        """Appends (v, 3) float64 world x y z, and (f, 3) indices of all vertices added so far."""
         self.vertices += len(positions)
         self.triangles += len(faces)
         if self.vertices > _MAX_VERTICES:
-            raise ValueError(
-                f"{self._path}: more than {_MAX_VERTICES} vertices: take a coarser level"
-            )
+            raise ValueError(f"{self._path}: over {_MAX_VERTICES} vertices: take a coarser level")
         if self._is_glb:
             local = (positions - self._origin).astype("<f4")
             self._vertex_file.write(local.tobytes())
@@ -96,12 +88,6 @@ class SurfaceFile:
         if len(positions):
             self._bounds[0] = np.minimum(self._bounds[0], positions.min(0))
             self._bounds[1] = np.maximum(self._bounds[1], positions.max(0))
-
-    def _write(self, error_type: type[BaseException] | None, *_: object) -> None:
-        """Writes the file at the end, unless there was an error."""
-        if error_type is None:
-            with self._temporary_path.open("wb") as file:
-                (self._write_glb if self._is_glb else self._write_ply)(file)
 
     def _write_ply(self, file: IO[bytes]) -> None:
         largest = max(1.0, float(np.abs(self._bounds).max())) if self.vertices else 1.0

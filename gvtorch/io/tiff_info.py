@@ -85,16 +85,14 @@ def shown_as(series: Any, width: int) -> tuple[bool, list[str]]:
     to be shown.
     """
     photometric = int(series.keyframe.photometric)
-    dropped = [note for number, note in _PHOTOMETRIC_DROPPED.items() if number == photometric]
+    dropped = [_PHOTOMETRIC_DROPPED[photometric]] if photometric in _PHOTOMETRIC_DROPPED else []
     if series.keyframe.tags.valueof("Orientation", 1) != 1:
         dropped.append("that its pages are to be shown turned or mirrored")
     return width in (3, 4) and photometric in (2, 6), dropped  # RGB, YCbCr
 
 
 def _check_ome_xml(path: str, description: str) -> None:
-    """Raises ValueError if OME-XML lists too many planes, or refers to files outside the folder of
-    `path`.
-    """
+    """Raises ValueError if OME-XML lists too many planes, or refers to files in other folders."""
     if not description[-10:].strip().endswith("OME>"):
         return
     if len(description) > _MAX_XML_CHARS:
@@ -111,10 +109,8 @@ def _check_ome_xml(path: str, description: str) -> None:
             count = finite_number(element.get(name))
             counts[name] = max(counts.get(name, 1), int(count or 1))
     for total in (counts.pop("PlaneCount"), math.prod(counts.values())):
-        if total > _MAX_LISTED_PLANES:
-            raise ValueError(
-                f"{path}: declares {total} planes, at most {_MAX_LISTED_PLANES} are read"
-            )
+        if total > (limit := _MAX_LISTED_PLANES):
+            raise ValueError(f"{path}: declares {total} planes, at most {limit} are read")
 
 
 def check_pictures(pages: Iterable[Any]) -> None:
@@ -172,10 +168,10 @@ def _unpack_lerc(packed: bytes, max_bytes: int) -> bytes:
 def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:
     """Reads the OME-XML of an image, found by its name, or by its number if that is not unique."""
     root = ElementTree.fromstring(xml)
-    images = [child for child in root.iter() if _tag(child) == "Image"]
+    images = root.findall(".//{*}Image")
     same_name = [image for image in images if image.get("Name") == name]
     chosen = same_name if len(same_name) == 1 else images[number : number + 1]
-    pixels = next((child for image in chosen for child in image if _tag(child) == "Pixels"), None)
+    pixels = chosen[0].find("{*}Pixels") if chosen else None
     if pixels is None:
         return ImageInfo(), (1.0, 1.0, 1.0), ["OME-XML, which tells nothing of this image"]
     sizes = [finite_number(pixels.get(f"PhysicalSize{axis}")) for axis in "XYZ"]
@@ -188,11 +184,11 @@ def ome_info(xml: str, number: int, name: str, width: int) -> FileMetadata:
     step_unit = pixels.get("TimeIncrementUnit", "s")
     if step is None and int(finite_number(pixels.get("SizeT")) or 1) > 1:
         step, step_unit = _step_of_planes(pixels)
-    elements = [child for child in pixels if _tag(child) == "Channel"]
+    elements = pixels.findall("{*}Channel")
     channels = [_ome_channel(element) for element in elements]
     if [int(e.get("SamplesPerPixel", 1)) for e in elements] == [3] and width == 3:
         channels = [*color_channels()]
-    if any(_tag(child) == "ROI" for child in root):
+    if root.find("{*}ROI") is not None:
         dropped.append("regions of interest (ROI)")
     return microscope_info(unit, channels, width, step, time_unit(step_unit)), spacing, dropped
 
@@ -209,7 +205,7 @@ def _step_of_planes(pixels: Any) -> tuple[float | None, str]:
     """Returns the mean time step between the first channel's first slices, and its unit."""
     times: dict[int, float] = {}
     unit = "s"
-    for plane in [child for child in pixels if _tag(child) == "Plane"][:_MAX_PLANES]:
+    for plane in pixels.findall("{*}Plane")[:_MAX_PLANES]:
         plane_time = finite_number(plane.get("DeltaT"))
         if plane_time is not None and plane.get("TheZ", "0") == plane.get("TheC", "0") == "0":
             times[int(plane.get("TheT", 0))] = plane_time
@@ -248,17 +244,11 @@ def imagej_info(
     if any(finite_number(metadata.get(f"{axis}origin")) for axis in "xyz"):
         dropped.append("the position of its origin")
     displayed = channels if any(c.color or c.window for c in channels) else []
-    info = microscope_info(
-        unit_name, displayed, width, step, time_unit(str(metadata.get("tunit", "sec")))
-    )
-    return info, spacing, dropped
+    step_unit = time_unit(str(metadata.get("tunit", "sec")))
+    return microscope_info(unit_name, displayed, width, step, step_unit), spacing, dropped
 
 
 def _color(table: Any) -> Rgb | None:
     """Returns the last colour of a look-up table; None if that is black."""
     last = np.asarray(table).reshape(3, -1)[:, -1] / 255
     return (float(last[0]), float(last[1]), float(last[2])) if last.any() else None
-
-
-def _tag(element: Any) -> str:
-    return str(element.tag).rpartition("}")[2]

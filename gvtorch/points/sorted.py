@@ -7,7 +7,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 
 from ..base import check
 from ..base.stage import Progress, no_progress
-from ..base.whole_file import name_in_errors
+from ..base.whole_file import durable_file
 from .grid import Codes, PointGrid, peak, point_shares
 from .points import Points
 from .table import Fold, Rows, Runs, Table, grouped
@@ -129,11 +128,8 @@ class SortedPoints:
         }
         grid = dataclasses.asdict(self.grid)
         meta = {"version": _VERSION, "width": self.width, "grid": grid, **tables_by_kind}
-        path = self.folder / _META
-        with name_in_errors(path), path.open("w", encoding="utf-8") as file:
-            json.dump(meta, file)
-            file.flush()
-            os.fsync(file.fileno())
+        with durable_file(self.folder / _META) as file:
+            file.write(json.dumps(meta).encode())
 
 
 def sort_points(

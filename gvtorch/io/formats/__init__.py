@@ -24,9 +24,7 @@ def find_format(path: str, *, raw: bool = False) -> Format:
     if raw and not Path(path).is_dir():
         return next(candidate for candidate in FORMATS if candidate.name == "RAW")
     if Path(path).is_dir():
-        raise ValueError(
-            f"{path}: holds neither a DICOM series, nor images, nor a Zarr or N5 array"
-        )
+        raise ValueError(f"{path}: holds no DICOM series, no images and no Zarr or N5 array")
     endings = ", ".join(ending for candidate in FORMATS for ending in candidate.endings)
     raise ValueError(
         f"{path}: unknown volume format; known endings: {endings}, or a folder of DICOM files or "

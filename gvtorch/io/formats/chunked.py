@@ -23,7 +23,7 @@ from ...base.image_info import ImageInfo
 from ...base.named_axes import ask_axes, axes_placement, even_steps, named_axes
 from ...base.units import spacing_of
 from ..cf_source import CfSource, cf_fields, unpack_coordinates
-from ..source import Index, Triple, VolumeSource
+from ..source import Index, VolumeSource
 from ..stores.chunk_files import ChunkFiles, begin_read, files_of
 from ..stores.ngff import read_json_file
 from ..stores.store_layout import is_number
@@ -136,17 +136,16 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
         axis_order = named_axes(names, shape) if axes is None else None
         for axis, name in enumerate(names):
             sibling = Path(folder).parent / name
-            if sibling.parent != Path(folder).parent or name == "..":
-                continue  # the name of an axis must not be a path to another folder
-            is_other = name and sibling != Path(folder)
-            if is_other and (description := _describe_array(str(sibling))) is not None:
+            # The name of an axis must not be a path to another folder.
+            if sibling.parent != Path(folder).parent or name == ".." or sibling == Path(folder):
+                continue
+            if (description := _describe_array(str(sibling))) is not None:
                 coordinates, files = _open_array(description[0], str(sibling), source.opened)
                 if coordinates.shape == (shape[axis],) and shape[axis] < 1 << 24:
                     future = begin_read(coordinates, files)
                     values = Deadline(_READ_TIMEOUT).wait(future, str(sibling))
                     packing = _read_attributes(str(sibling))
-                    values = unpack_coordinates(values, packing)
-                    steps[axis] = even_steps(name, values, dropped)
+                    steps[axis] = even_steps(name, unpack_coordinates(values, packing), dropped)
                     units[axis] = str(packing.get("units", "")) or None
     axis_order = axis_order or ask_axes(path, shape, axes)
     placement, info_fields = axes_placement(axis_order, shape, steps, units)
@@ -192,10 +191,7 @@ def open_n5(path: str, key: str | None = None, axes: str | None = None) -> Chunk
         metadata = (_describe_array(folder) or ("", {}))[1]
     source, shape = _open_source(path, "n5", folder)
     axis_order = ask_axes(path, shape[::-1], axes)[::-1]
-    spacing, origin, unit = _n5_placement(metadata, axis_order)
-    return replace(
-        source, axes=axis_order, spacing=spacing, origin=origin, info=ImageInfo(unit=unit)
-    )
+    return replace(source, axes=axis_order, **_n5_placement(metadata, axis_order))
 
 
 def _choose_array(path: str, key: str | None) -> str:
@@ -222,8 +218,8 @@ def _open_source(path: str, driver: str, folder: str) -> tuple[ChunkedSource, tu
     return replace(source, shape=shape, stored=dtype.str, packed=dtype.str), shape
 
 
-def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Triple, str | None]:
-    """Returns voxel size, origin and unit of an N5 array; `axis_order`: the fastest first."""
+def _n5_placement(metadata: dict[str, Any], axis_order: str) -> dict[str, Any]:
+    """Returns spacing, origin and info of an N5 array; `axis_order`: the fastest first."""
     rank = len(axis_order)
     sizes: Any = metadata.get("pixelResolution", metadata.get("resolution"))
     unit: Any = metadata.get("units", metadata.get("unit"))
@@ -242,10 +238,9 @@ def _n5_placement(metadata: dict[str, Any], axis_order: str) -> tuple[Triple, Tr
     voxel_size = [abs(steps.get(a, 1.0) * factors.get(a, 1.0)) for a in "xyz"]
     spacing, unit_name = spacing_of(voxel_size, [unit if isinstance(unit, str) else None] * 3)
     # A coarse voxel's centre is that of the fine ones in it: (f - 1) / 2 of them further.
-    x, y, z = (
-        starts.get(a, 0.0) + (factors.get(a, 1.0) - 1) / 2 * abs(steps.get(a, 1.0)) for a in "xyz"
-    )
-    return spacing, (x, y, z), unit_name
+    shifts = {a: (factors.get(a, 1.0) - 1) / 2 * abs(steps.get(a, 1.0)) for a in "xyz"}
+    position = tuple(starts.get(a, 0.0) + shift for a, shift in shifts.items())
+    return {"spacing": spacing, "origin": position, "info": ImageInfo(unit=unit_name)}
 
 
 def _numbers_or_default(values: Any, default: float, count: int) -> list[float]:

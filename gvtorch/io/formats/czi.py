@@ -17,14 +17,8 @@ from ...base.units import NO_DEPTH, spacing_of
 from ..source import FileMetadata, Index, VolumeSource, microscope_info, read_planes
 from .format import Format, choose
 
-_DTYPES = {
-    "Gray8": ("u1", 1),
-    "Gray16": ("u2", 1),
-    "Gray32Float": ("f4", 1),
-    "Bgr24": ("u1", 3),
-    "Bgr48": ("u2", 3),
-    "Bgr96Float": ("f4", 3),
-}
+_GRAY = {"Gray8": ("u1", 1), "Gray16": ("u2", 1), "Gray32Float": ("f4", 1)}
+_DTYPES = {**_GRAY, "Bgr24": ("u1", 3), "Bgr48": ("u2", 3), "Bgr96Float": ("f4", 3)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,18 +65,14 @@ def open_czi(path: str, key: str | None = None) -> CziSource:
             chosen, others = choose(path, "scene", sorted(scenes), key)
             scene = sorted(scenes)[chosen]
             bounds = scenes[scene]
-    extra_axes = {
-        axis: count for axis, (_, count) in box.items() if axis not in "TCZXYSM" and count > 1
-    }
-    if extra_axes:
-        axis_sizes = ", ".join(f"{name} {size}" for name, size in extra_axes.items())
-        raise ValueError(f"{path}: has axes other than T, C, Z, Y, X: {axis_sizes}")
+    sizes = {axis: count for axis, (_, count) in box.items()}
+    if extra_axes := [f"{a} {n}" for a, n in sizes.items() if a not in "TCZXYSM" and n > 1]:
+        raise ValueError(f"{path}: has axes other than T, C, Z, Y, X: {', '.join(extra_axes)}")
     if len(pixel_types) != 1 or pixel_types[0] not in _DTYPES:
-        raise ValueError(
-            f"{path}: pixels are {', '.join(map(str, pixel_types))}; expected one kind"
-        )
+        kinds = ", ".join(map(str, pixel_types))
+        raise ValueError(f"{path}: pixels are {kinds}; expected one kind")
     stored, colors = _DTYPES[pixel_types[0]]
-    counts = [box[name][1] for name in "TCZ"]
+    counts = [sizes[name] for name in "TCZ"]
     if counts[1] > 1 and colors > 1:
         raise ValueError(f"{path}: {counts[1]} channels of colours; expected one")
     info, spacing, dropped = _read_metadata(xml, counts[1], colors, stored)
@@ -107,19 +97,13 @@ def _read_metadata(xml: str, width: int, colors: int, stored: str) -> FileMetada
         value = finite_number(element.findtext("Value"))
         sizes[element.get("Id", "")] = value * 1e6 if value else None
     spacing, unit = spacing_of([sizes.get(axis) for axis in "XYZ"], ["um"] * 3)
-    display_settings = {
-        element.get("Id"): element
-        for element in root.iterfind(".//DisplaySetting/Channels/Channel")
-    }
-    channels = [
-        _channel(element, display_settings.get(element.get("Id")), stored)
-        for element in root.iterfind(".//Information/Image/Dimensions/Channels/Channel")
-    ]
+    shown = {e.get("Id"): e for e in root.iterfind(".//DisplaySetting/Channels/Channel")}
+    dimensions = ".//Information/Image/Dimensions"
+    elements = root.iterfind(f"{dimensions}/Channels/Channel")
+    channels = [_channel(element, shown.get(element.get("Id")), stored) for element in elements]
     if colors == 3:
         channels = [*color_channels()]
-    time_step = finite_number(
-        root.findtext(".//Information/Image/Dimensions/T/Positions/Interval/Increment")
-    )
+    time_step = finite_number(root.findtext(f"{dimensions}/T/Positions/Interval/Increment"))
     dropped = []
     if unit and sizes.get("Z") is None and int(root.findtext(".//Image/SizeZ") or 1) > 1:
         dropped.append(NO_DEPTH)

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from ...base.boxes import check_extent
 from ..dicom_codecs import plugin_of
 from ..dicom_frames import DicomFrame, frames_of, image_info, order_frames
 from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
@@ -175,11 +174,12 @@ def _syntax(file: str) -> Any:
 
 
 def _check_deflated(file: str) -> None:
-    if _syntax(file) != _DEFLATED:
+    meta = _file_meta(file)
+    if meta.get("TransferSyntaxUID") != _DEFLATED:
         return
     size, decompressor = 0, zlib.decompressobj(-zlib.MAX_WBITS)
     with open(file, "rb") as stream:
-        stream.seek(144 + int(_file_meta(file).get("FileMetaInformationGroupLength", 0)))
+        stream.seek(144 + int(meta.get("FileMetaInformationGroupLength", 0)))
         while size <= _MAX_UNPACKED_BYTES and (packed := stream.read(1 << 16)):
             while packed and size <= _MAX_UNPACKED_BYTES:
                 size += len(decompressor.decompress(packed, 1 << 20))
@@ -221,14 +221,12 @@ def _series_source(path: str, headers: list[Any]) -> DicomSource:
     rows, columns, samples = _image_shape(first)
     frames: list[DicomFrame] = []
     for header in headers:
-        count = _frame_count(header)
-        check_extent(header.filename, (count, rows, columns), max_values=1 << 40)
         if _image_shape(header) != (rows, columns, samples):
             raise ValueError(
                 f"{path}: a series of images of different sizes: {(rows, columns, samples)} and "
                 f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
             )
-        frames += frames_of(header, count)
+        frames += frames_of(header, _frame_count(header))
     times, affine, dropped, time_fields = order_frames(path, frames)
     depth, frames = len(times[0]), list(chain(*times))
     placement = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
@@ -255,9 +253,9 @@ def _image_shape(header: Any) -> tuple[int, int, int]:
 
 def _dtype(headers: Sequence[Any], frames: Sequence[DicomFrame]) -> str:
     """Returns the smallest dtype that holds every value after rescaling."""
-    float_dtype = {32: "float32", 64: "float64"}.get(headers[0].get("BitsAllocated"))
-    if "BitsStored" not in headers[0] and float_dtype:  # Float or Double Float Pixel Data
-        return float_dtype
+    bits = headers[0].get("BitsAllocated")
+    if "BitsStored" not in headers[0] and bits in (32, 64):  # Float or Double Float Pixel Data
+        return f"float{bits}"
     ranges, extremes = {_stored_range(header) for header in headers}, list[float]()
     for slope, intercept in {(frame.slope, frame.intercept) for frame in frames}:
         if not (slope.is_integer() and intercept.is_integer()):
@@ -279,7 +277,6 @@ def _stored_range(header: Any) -> tuple[int, int]:
 
 
 def _decode_images(file: str, numbers: list[int]) -> Iterator[np.ndarray]:
-    """Decodes some of the images of a file."""
     import pydicom
     from pydicom.pixels import iter_pixels
 

@@ -70,9 +70,8 @@ class Format:
 
     def need_library(self, path: str) -> None:
         """Raises ImportError, with the pip command, if the library is missing."""
-        need_library(
-            f"{path}: reading this format", self.library or __name__, self.package, self.extra
-        )
+        context = f"{path}: reading this format"
+        need_library(context, self.library or __name__, self.package, self.extra)
 
 
 def choose(
@@ -96,10 +95,8 @@ def choose(
         ValueError: There are no items, or none that matches `key`.
     """
     numbers = [index if isinstance(name, str) else name for index, name in enumerate(names)]
-    listed = [
-        f"{number} {name!r}" if isinstance(name, str) else str(number)
-        for number, name in zip(numbers, names, strict=True)
-    ]
+    pairs = zip(numbers, names, strict=True)
+    listed = [f"{n} {name!r}" if isinstance(name, str) else str(n) for n, name in pairs]
     if key is None and names:
         others = f"{len(names) - 1} other {_plural(noun)}; key (--key) chooses among"
         dropped = (f"{others} {_join_names(listed)}",) if len(names) > 1 else ()
@@ -125,9 +122,8 @@ def not_chosen(
     if key is not None:
         message = f"has no {noun} {key!r}; it holds {_join_names(names) or f'none{qualifier}'}"
     elif names:
-        message = (
-            f"holds {len(names)} {_plural(noun)}, choose one with key (--key): {_join_names(names)}"
-        )
+        listed = _join_names(names)
+        message = f"holds {len(names)} {_plural(noun)}, choose one with key (--key): {listed}"
     else:
         message = f"holds no {noun}{qualifier}"
     return ValueError(f"{path}: {message}")

@@ -52,7 +52,12 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
     """
     import h5py
 
-    _check_not_classic(path)
+    with open(path, "rb") as start:
+        if re.match(rb"CDF[\1\2\5]", start.read(4)):
+            raise ValueError(
+                f"{path}: is a NetCDF file of the classic kind; nccopy -k nc4 {path} NEW.nc makes "
+                "one of NetCDF 4, which can be read"
+            )
     with h5py.File(path, "r") as file:
         if key is not None:
             _check_files(path, file, key)
@@ -72,26 +77,9 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
         if info_fields["unit"] is None and len(element_size) == 3:
             placement["spacing"], info_fields["unit"] = spacing_of(element_size[::-1], ["um"] * 3)
-    info = replace(info, **info_fields)
-    return Hdf5Source(
-        path=path,
-        shape=shape,
-        axes=axis_order,
-        name=name,
-        **value_fields,
-        info=info,
-        dropped=tuple(dropped),
-        **placement,
-    )
-
-
-def _check_not_classic(path: str) -> None:
-    with open(path, "rb") as file:
-        if re.match(rb"CDF[\1\2\5]", file.read(4)):
-            raise ValueError(
-                f"{path}: is a NetCDF file of the classic kind; nccopy -k nc4 {path} NEW.nc makes "
-                "one of NetCDF 4, which can be read"
-            )
+    fields = {"path": path, "shape": shape, "axes": axis_order, "name": name, **value_fields}
+    fields |= {"info": replace(info, **info_fields), "dropped": tuple(dropped), **placement}
+    return Hdf5Source(**fields)
 
 
 def _check_files(path: str, file: Any, name: str, links_left: int = _MAX_LINKS) -> None:
@@ -198,10 +186,9 @@ def _check_dataset(path: str, name: str, dataset: Any) -> None:
         )
     if dataset.chunks is None and dataset.external is None and not dataset.is_virtual:
         stored_bytes = dataset.id.get_storage_size()
-        needed_bytes = math.prod(dataset.shape) * dataset.dtype.itemsize
-        if stored_bytes and stored_bytes < needed_bytes:
+        if stored_bytes and stored_bytes < dataset.nbytes:
             raise ValueError(
-                f"{path}: {name} takes {needed_bytes} bytes, the file has {stored_bytes}"
+                f"{path}: {name} takes {dataset.nbytes} bytes, the file has {stored_bytes}"
             )
 
 

@@ -71,11 +71,11 @@ def _slices(path: str) -> list[Path]:
     return next(iter(files.values()), [])
 
 
-def _is_image_folder(path: str) -> bool:
-    return Path(path).is_dir() and not is_zarr(path)
-
-
-@Format("a folder of images", matches=_is_image_folder, library="imagecodecs")
+@Format(
+    "a folder of images",
+    matches=lambda path: Path(path).is_dir() and not is_zarr(path),
+    library="imagecodecs",
+)
 def open_folder(path: str) -> SlicesSource:
     """Opens a folder of slices, in natural order of their names."""
     files = _slices(path)
@@ -124,7 +124,6 @@ def _opened_slice(file: str) -> Iterator[tuple[Any, list[int]]]:
 
 
 def _decode_image(file: str) -> np.ndarray:
-    """Decodes an image."""
     codec = _CODECS.get(Path(file).suffix.lower())
     if codec is None:
         with _opened_slice(file) as (series, axes):
@@ -159,6 +158,5 @@ def _header_shape(file: str) -> tuple[Any, ...]:
 
 def _natural_key(name: str) -> list[tuple[int, str]]:
     """Returns a sorting key, by which s9 comes before s10."""
-    return [
-        (int(part), part) if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)
-    ]
+    parts = re.split(r"(\d+)", name)
+    return [(int(part) if part.isdecimal() else -1, part) for part in parts]

@@ -61,17 +61,22 @@ def _image_source(
     description = "./Data/Image/ImageDescription"
     channels = element.findall(f"{description}/Channels/ChannelDescription")
     dimensions = element.findall(f"{description}/Dimensions/DimensionDescription")
-    stored = _stored_dtype(path, channels)
+    kinds = {(int(c.get("DataType", 0)), -(-int(c.get("Resolution", 8)) // 8)) for c in channels}
+    if len(kinds) != 1 or (kind := kinds.pop()) not in _DTYPES:
+        raise ValueError(f"{path}: channels of several or unknown kinds of numbers")
+    stored = _DTYPES[kind]
     axes = [_axis(path, dimension) for dimension in dimensions]
     if len(channels) > 1:
-        axes.insert(0, _channel_axis(path, channels))
+        offsets = [int(channel.get("BytesInc", 0)) for channel in channels]
+        strides = {b - a for a, b in itertools.pairwise(offsets)}
+        if len(strides) != 1:
+            raise ValueError(f"{path}: channels are not evenly spaced")
+        axes.insert(0, _Axis("c", len(channels), strides.pop()))
     offset, block_bytes = _find_block(element, blocks) or (0, 0)
     image_bytes = sum((axis.size - 1) * axis.stride for axis in axes) + np.dtype(stored).itemsize
     is_valid = axes and all(axis.size >= 1 and axis.stride >= 0 for axis in axes)
     if not is_valid or not 0 < image_bytes <= block_bytes:
-        raise ValueError(
-            f"{path}: the image takes {image_bytes} bytes, its block has {block_bytes}"
-        )
+        raise ValueError(f"{path}: an image of {image_bytes} bytes in a block of {block_bytes}")
     steps = {axis.letter: axis.step for axis in axes}
     units = {axis.letter: axis.unit or "m" for axis in axes}
     spacing, unit = spacing_of([steps.get(a) for a in "xyz"], [units.get(a, "m") for a in "xyz"])
@@ -96,14 +101,6 @@ def _image_source(
     )
 
 
-def _stored_dtype(path: str, channels: list[Any]) -> str:
-    """Returns the dtype that all channels have; raises ValueError if there is none."""
-    kinds = {(int(c.get("DataType", 0)), -(-int(c.get("Resolution", 8)) // 8)) for c in channels}
-    if len(kinds) != 1 or (kind := kinds.pop()) not in _DTYPES:
-        raise ValueError(f"{path}: channels of several or unknown kinds of numbers")
-    return _DTYPES[kind]
-
-
 class _Axis(NamedTuple):
     letter: str
     size: int
@@ -114,7 +111,6 @@ class _Axis(NamedTuple):
 
 
 def _axis(path: str, element: Any) -> _Axis:
-    """Returns an axis from its description."""
     number, size = int(element.get("DimID", 0)), int(element.get("NumberOfElements", 0))
     letter = _AXIS_LETTERS.get(number, "-")
     if letter == "-" and size > 1:
@@ -122,17 +118,8 @@ def _axis(path: str, element: Any) -> _Axis:
         raise ValueError(f"{path}: an image of {size} {name} is not known here")
     length = float(element.get("Length") or 0)
     step = abs(length) / (size - 1) if size > 1 and length else None
-    return _Axis(
-        letter, size, int(element.get("BytesInc", 0)), step, element.get("Unit"), length < 0
-    )
-
-
-def _channel_axis(path: str, channels: list[Any]) -> _Axis:
-    offsets = [int(channel.get("BytesInc", 0)) for channel in channels]
-    strides = {b - a for a, b in itertools.pairwise(offsets)}
-    if len(strides) != 1:
-        raise ValueError(f"{path}: channels are not evenly spaced")
-    return _Axis("c", len(channels), strides.pop())
+    stride, unit = int(element.get("BytesInc", 0)), element.get("Unit")
+    return _Axis(letter, size, stride, step, unit, length < 0)
 
 
 def _channel(element: Any) -> ChannelInfo:
@@ -161,7 +148,7 @@ def _read_blocks(file: IO[bytes], size: int) -> dict[str, tuple[int, int]]:
     blocks: dict[str, tuple[int, int]] = {}
     while (start := file.tell()) < size and len(blocks) < _MAX_BLOCKS:
         header = file.read(22)  # the block's length has four bytes, or eight
-        layout = "<IIBIBI" if header[13:14] == b"\x2a" else "<IIBQBI"
+        layout = "<IIBQBI" if header[17:18] == b"\x2a" else "<IIBIBI"
         if len(header) < struct.calcsize(layout):
             raise ValueError("ends within a block's head")
         magic, _, marker, length, second_marker, count = struct.unpack_from(layout, header)

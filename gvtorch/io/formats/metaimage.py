@@ -17,7 +17,14 @@ import numpy as np
 
 from ...base.image_info import ImageInfo, color_channels
 from ...base.units import length_unit
-from ..source import LPS_TO_RAS, ArraySource, VolumeSource, number_type, place_axes
+from ..source import (
+    LPS_TO_RAS,
+    ArraySource,
+    VolumeSource,
+    number_type,
+    place_axes,
+    time_fields,
+)
 from ..text_source import TextSource
 from .format import Format
 
@@ -62,9 +69,7 @@ def open_metaimage(path: str) -> VolumeSource:
     data_name = header["ElementDataFile"]
     data_file = str(Path(path).parent / data_name)
     if data_name.upper() == "LIST" or ("%" in data_name and not os.path.exists(data_file)):
-        raise ValueError(
-            f"{path}: its slices are in separate files (ElementDataFile = {data_name})"
-        )
+        raise ValueError(f"{path}: its slices are in several files (ElementDataFile = {data_name})")
     is_local = data_name.upper() == "LOCAL"
     data_file = path if is_local else data_file
     header_size = int(header.get("HeaderSize", 0))
@@ -83,23 +88,15 @@ def open_metaimage(path: str) -> VolumeSource:
 def _read_header(path: str) -> tuple[dict[str, str], int]:
     """Returns the header's values by name, up to ElementDataFile, and the offset of its end."""
     with open(path, "rb") as file:
-        text = file.read(_MAX_HEADER_BYTES)
+        text = file.read(_MAX_HEADER_BYTES).decode("latin-1")
     fields: dict[str, str] = {}
-    position = 0
-    while position < len(text):
-        end = text.find(b"\n", position)
-        end = len(text) if end < 0 else end
-        match = re.fullmatch(r"\s*(\w+)\s*[=:]\s*(.*?)\s*", text[position:end].decode("latin-1"))
-        position = end + 1
-        if match is None:
-            break
-        fields[match[1]] = match[2]
-        if match[1] == "ElementDataFile":
-            for name in ("DimSize", "ElementType"):
-                if name not in fields:
-                    raise ValueError(f"the header has no {name}")
-            return fields, position
-    raise ValueError("no MetaImage: the header has no ElementDataFile")
+    position, line = 0, re.compile(r"[^\S\n]*(\w+)[^\S\n]*[=:](.*)\n?")
+    while "ElementDataFile" not in fields and (match := line.match(text, position)):
+        fields[match[1]], position = match[2].strip(), match.end()
+    for name in ("ElementDataFile", "DimSize", "ElementType"):
+        if name not in fields:
+            raise ValueError(f"no MetaImage: the header has no {name}")
+    return fields, position
 
 
 def _is_true(header: dict[str, str], *names: str) -> bool:
@@ -110,9 +107,7 @@ def _is_true(header: dict[str, str], *names: str) -> bool:
 
 
 def _numbers(path: str, header: dict[str, str], count: int, *names: str) -> np.ndarray | None:
-    """Returns the `count` numbers of the first field of `names` that the header has; None if it
-    has none of them.
-    """
+    """Returns `count` numbers of the first field that the header has; None if it has none."""
     text = next((header[name] for name in names if name in header), None)
     values = np.array([float(v) for v in text.split()]) if text else None
     if values is not None and len(values) != count:
@@ -142,17 +137,13 @@ def _placement(
 def _info(path: str, header: dict[str, str], width: int, rank: int) -> ImageInfo:
     """Returns the header's metadata of the values."""
     modality = header.get("Modality", "")
-    steps, offset = (_numbers(path, header, rank, *n) for n in (_STEP_FIELDS, _OFFSET_FIELDS))
-    step, origin = (
-        float(values[3]) if rank == 4 and values is not None and math.isfinite(values[3]) else 0.0
-        for values in (steps, offset)
-    )
+    fields = (_numbers(path, header, rank, *names) for names in (_STEP_FIELDS, _OFFSET_FIELDS))
+    step, origin = (0.0 if n is None or rank < 4 else float(n[3]) for n in fields)
     color = width == 3 and header["ElementType"].startswith("MET_UCHAR")
     return ImageInfo(
         unit=length_unit(header.get("DistanceUnits", "mm")),
         quantity="HU" if modality == "MET_MOD_CT" else None,
         channels=color_channels() if color else (),
         space="right-anterior-superior",
-        time_step=step if step > 0 else None,
-        time_origin=origin,
+        **time_fields(step, None, origin),
     )

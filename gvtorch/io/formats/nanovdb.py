@@ -12,7 +12,7 @@ import mmap
 import os
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -81,9 +81,7 @@ def open_nanovdb(path: str, key: str | None = None) -> SparseSource:
     grid = grids[chosen]
     if grid.type_code not in _TYPES:
         type_name = _REFUSED_TYPES.get(grid.type_code, f"type {grid.type_code}")
-        raise ValueError(
-            f"{path}: grid {grid.name!r} holds {type_name}, not a grid of numbers that can be read"
-        )
+        raise ValueError(f"{path}: grid {grid.name!r} holds {type_name}, not a grid of numbers")
     _, dtype, width = _TYPES[grid.type_code]
     affine, low, high = _placement(_read_grid(path, grid, _ROOT_OFFSET + 24), grid)
     grid_bytes = grid.size if grid.codec != "none" else 0
@@ -105,18 +103,14 @@ def _list_grids(path: str) -> list[GridMetadata]:
             magic, version, count, _ = struct.unpack("<8sIHH", file.read(16))
             if magic not in _FILE_MAGICS or version >> 21 != _VERSION:
                 actual = f"of version {version >> 21}" if magic in _FILE_MAGICS else repr(magic)
-                raise ValueError(
-                    f"begins a segment {actual}; expected NanoVDB of version {_VERSION}"
-                )
+                raise ValueError(f"a segment {actual}; expected NanoVDB of version {_VERSION}")
             for grid in [_read_metadata(file) for _ in range(count)]:
                 offset = file.tell()
                 packed_size = _packed_size(file, grid, size)
                 grids.append(grid._replace(offset=offset, packed_size=packed_size))
-                if packed_size > size - offset:
-                    raise ValueError(
-                        f"grid {grid.name!r} takes {packed_size} bytes, "
-                        f"the file has {size - offset}"
-                    )
+                if packed_size > (left := size - offset):
+                    grid_bytes = f"grid {grid.name!r} takes {packed_size} bytes"
+                    raise ValueError(f"{grid_bytes}, the file has {left}")
                 file.seek(offset + packed_size)
             if len(grids) > _MAX_GRIDS or not count:
                 raise ValueError(f"has {len(grids)} grids; expected 1 to {_MAX_GRIDS}")
@@ -184,10 +178,8 @@ def _placement(data: Any, grid: GridMetadata) -> tuple[np.ndarray, np.ndarray, n
     if len(data) < _ROOT_OFFSET + 24 or bytes(data[:8]) not in _GRID_MAGICS:
         raise ValueError("a grid does not begin as grids of NanoVDB do")
     (type_code,) = struct.unpack_from("<I", data, _TYPE_OFFSET)
-    if type_code != grid.type_code:
-        raise ValueError(
-            f"grid {grid.name!r} is of type {type_code}, its file declares {grid.type_code}"
-        )
+    if type_code != (declared := grid.type_code):
+        raise ValueError(f"grid {grid.name!r} is of type {type_code}, its file declares {declared}")
     affine = np.eye(4)
     affine[:3, :3] = np.frombuffer(data, "<f8", 9, 384).reshape(3, 3)
     affine[:3, 3] = np.frombuffer(data, "<f8", 3, 528)
@@ -269,32 +261,23 @@ class NanoGrid(SparseGrid):
         corners = (keys.astype(np.int64) << 44 >> 44) * 4096  # 20 bits, signed
         has_child = root_table["child"] != 0
         child_offsets = _ROOT_OFFSET + root_table["child"][has_child]
-        node_offsets = [_checked_offsets(child_offsets, len(data), layout.entries_start[0])]
+        inner = zip(layout.entries_start, COUNTS, strict=False)
+        sizes = [*(start + n**3 * layout.entry_size for start, n in inner), layout.leaf_size]
+        node_offsets = [_checked_offsets(child_offsets, len(data), sizes[0])]
         origins = [corners[has_child]]
         for level in (0, 1):
-            node_bytes = layout.entries_start[1] if level == 0 else layout.leaf_size
-            children = list(_children(data, layout, level, node_offsets[-1], origins[-1]))
-            empty = np.zeros((0, 3), np.int64)
-            child_offsets = np.concatenate([empty[:, 0], *(part for part, _ in children)])
-            origins.append(np.concatenate([empty, *(part for _, part in children)]))
-            node_offsets.append(_checked_offsets(child_offsets, len(data), node_bytes))
-        sizes = (
-            layout.entries_start[0] + COUNTS[0] ** 3 * layout.entry_size,
-            layout.entries_start[1] + COUNTS[1] ** 3 * layout.entry_size,
-            layout.leaf_size,
-        )
+            children, firsts = _children(data, layout, level, node_offsets[-1], origins[-1])
+            node_offsets.append(_checked_offsets(children, len(data), sizes[level + 1]))
+            origins.append(firsts)
         _check_apart(node_offsets, sizes)
         counts = [len(part) for part in node_offsets]
         declared = struct.unpack_from("<3I", data, _COUNTS_OFFSET)
         if counts != [*declared[::-1]]:
-            raise ValueError(
-                f"the tree has {counts[::-1]} nodes, leaves first; it declares {declared}"
-            )
+            raise ValueError(f"it has {counts[::-1]} nodes, leaves first; it declares {declared}")
+        background_start = _ROOT_OFFSET + _round_up(28, np.dtype(dtype).itemsize)
         return cls(
             dtype=np.dtype(dtype),
-            background=np.ndarray(
-                (width,), dtype, data, _ROOT_OFFSET + _round_up(28, np.dtype(dtype).itemsize)
-            ),
+            background=np.ndarray((width,), dtype, data, background_start),
             origins=(origins[0], origins[1], origins[2]),
             root_origins=corners[~has_child],
             root_values=root_table["value"][~has_child],
@@ -306,13 +289,11 @@ class NanoGrid(SparseGrid):
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
         n, offset = COUNTS[level], int(self.node_offsets[level][number])
-        width, item_bytes = len(self.background), self.dtype.itemsize
-        values_start = offset + self.layout.entries_start[level]
-        values = np.ndarray(
-            (n**3, width), self.dtype, self.data, values_start, (self.layout.entry_size, item_bytes)
-        )
+        shape, strides = (n**3, len(self.background)), (self.layout.entry_size, self.dtype.itemsize)
+        start = offset + self.layout.entries_start[level]
+        values = np.ndarray(shape, self.dtype, self.data, start, strides)
         is_child = bits(self.data, offset + 32 + n**3 // 8, n**3)
-        return values.reshape(n, n, n, width), ~is_child.reshape(n, n, n)
+        return values.reshape(n, n, n, -1), ~is_child.reshape(n, n, n)
 
     def leaf(self, offset: int) -> np.ndarray:
         start = offset + self.layout.voxels_start
@@ -339,21 +320,22 @@ def _codes(data: Any, offset: int, code_bits: int) -> np.ndarray:
 
 def _children(
     data: Any, layout: NodeFormat, level: int, node_offsets: np.ndarray, origins: np.ndarray
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields for each node the offsets of its children, and their first voxels."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the offsets of the children of nodes, and their first voxels."""
     n, strides = COUNTS[level], (layout.entry_size,)
+    offsets, corners = [np.zeros(0, np.int64)], [np.zeros((0, 3), np.int64)]
     for offset, origin in zip(node_offsets.tolist(), origins, strict=True):
         is_child = bits(data, offset + 32 + n**3 // 8, n**3)
         steps_start = offset + layout.entries_start[level]
         child_steps = np.ndarray((n**3,), "<i8", data, steps_start, strides)
         positions = np.argwhere(is_child.reshape(n, n, n)) * SIDES[level + 1]
-        yield offset + child_steps[is_child], origin + positions
+        offsets.append(offset + child_steps[is_child])
+        corners.append(origin + positions)
+    return np.concatenate(offsets), np.concatenate(corners)
 
 
 def _checked_offsets(offsets: np.ndarray, size: int, node_bytes: int) -> np.ndarray:
-    """Returns the offsets of nodes; raises ValueError unless all differ, are aligned, and have
-    `node_bytes` bytes behind them.
-    """
+    """Returns offsets of nodes; raises ValueError unless they differ, are aligned and inside."""
     if len(offsets) and not (offsets.min() >= _ROOT_OFFSET and offsets.max() <= size - node_bytes):
         raise ValueError(f"a node lies outside of the grid's {size} bytes")
     if (offsets % _ALIGNMENT).any():

@@ -17,7 +17,7 @@ from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.messages import collected_log
 from ...base.units import length_unit, time_unit
 from ..budget import MAX_UNPACK_RATIO
-from ..source import ArraySource, Index, VolumeSource, place_axes
+from ..source import ArraySource, Index, VolumeSource, place_axes, time_fields
 from .format import Format
 
 _LABEL_INTENT = 1002
@@ -76,14 +76,11 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
     except KeyError:
         length = period = "unknown"
         dropped.append(f"xyzt_units {int(header['xyzt_units'])}, which are none")
-    step: float | None = None
-    origin = 0.0
+    times: dict[str, Any] = {}
     if len(shape) > 3 and shape[3] > 1:
-        step, origin = float(header["pixdim"][4]), float(header["toffset"])
+        times = time_fields(float(header["pixdim"][4]), time_unit(period), float(header["toffset"]))
         if time_unit(period) is None and period != "unknown":
             dropped.append(f"the fourth axis counts {period}, and is read as time")
-        step = step if math.isfinite(step) and step > 0 else None
-        origin = origin if math.isfinite(origin) else 0.0
     if int(header["qform_code"]) > 0 and int(header["sform_code"]) > 0:
         forms = header.get_qform(), header.get_sform()
         if not np.allclose(*forms, rtol=1e-3, atol=1e-2 * float(header["pixdim"][1:4].min())):
@@ -100,9 +97,7 @@ def _info(image: Any, shape: tuple[int, ...]) -> tuple[ImageInfo, list[str]]:
         channels=tuple(channels),
         labels=int(header["intent_code"]) == _LABEL_INTENT,
         space="right-anterior-superior",
-        time_step=step,
-        time_origin=origin,
-        time_unit=time_unit(period) if step is not None else None,
+        **times,
     )
     return info, dropped
 

@@ -17,7 +17,7 @@ from ...base.image_info import ChannelInfo, ImageInfo, color_channels
 from ...base.named_axes import ask_axes
 from ...base.units import length_unit, time_unit
 from ..budget import check_regular
-from ..source import ArraySource, VolumeSource, number_type, place_axes
+from ..source import ArraySource, VolumeSource, number_type, place_axes, time_fields
 from ..text_source import TextSource
 from .format import Format
 
@@ -227,14 +227,13 @@ def _info(
     unit = unit_names.pop() if len(unit_names) == 1 else None
     if unit is None and any(spatial):
         dropped.append(f"units of space {', '.join(spatial)}")
-    step, origin, step_unit = None, 0.0, None
+    times: dict[str, Any] = {}
     if "t" in axis_roles:
         time_axis = axis_roles.index("t")
         steps, first = (values[time_axis] for values in _steps(header, len(axis_roles)))
         steps = (*_directions(header, len(axis_roles))[time_axis, 3:], steps)
         step = next((float(n) for n in steps if np.isfinite(n) and n > 0), None)
-        origin = float(first) if np.isfinite(first) else 0.0
-        step_unit = time_unit(units[time_axis]) if step else None
+        times = time_fields(step, time_unit(units[time_axis]), float(first))
     space = str(header.get("space", "")).lower().removesuffix("-time")
     info = ImageInfo(
         unit=unit,
@@ -242,9 +241,7 @@ def _info(
         quantity=str(header.get("sample units", "")) or None,
         labels=any(str(name).startswith("Segment0_") for name in header),
         space=_SPACES.get(space, space) or None,
-        time_step=step,
-        time_origin=origin,
-        time_unit=step_unit,
+        **times,
     )
     return info, dropped
 

@@ -23,12 +23,9 @@ class OmeZarrSource(VolumeSource):
     key: str | None
 
     def read_stored(self, index: Index) -> np.ndarray:
-        low, high = box_of(index[1:4])
-        stores = [
-            _store(self.path, self.key, self.opened, time)
-            for time in range(index[0].start, index[0].stop)
-        ]
-        return np.stack([store.read_stored(low, high, timeout=_TIMEOUT) for store in stores])
+        times, box = range(index[0].start, index[0].stop), box_of(index[1:4])
+        stores = (_store(self.path, self.key, self.opened, time) for time in times)
+        return np.stack([store.read_stored(*box, timeout=_TIMEOUT) for store in stores])
 
 
 @functools.lru_cache(maxsize=4)

@@ -38,14 +38,6 @@ _TYPES: dict[str, tuple[str, int]] = {
     "vec3d": ("<f8", 3),
     "vec3i": ("<i4", 3),
 }
-_METADATA_LAYOUTS = {
-    "vec3i": "<3i",
-    "int32": "<i",
-    "int64": "<q",
-    "float": "<f",
-    "double": "<d",
-    "bool": "<?",
-}
 # Number of doubles in a transform's map, and the index of its translation and of its scale.
 _MAPS = {
     "UniformScaleMap": (15, None, 0),
@@ -72,7 +64,6 @@ class Cursor:
         return start
 
     def take(self, count: int) -> bytes:
-        """Reads bytes."""
         start = self.skip(count)
         return bytes(self.data[start : start + count])
 
@@ -81,11 +72,9 @@ class Cursor:
         return struct.unpack(layout, self.take(struct.calcsize(layout)))
 
     def number(self, layout: str) -> Any:
-        """Reads a number."""
         return self.numbers(layout)[0]
 
     def array(self, dtype: Any, count: int) -> np.ndarray:
-        """Reads an array."""
         dtype = np.dtype(dtype)
         return np.frombuffer(self.data, dtype, count, self.skip(count * dtype.itemsize))
 
@@ -94,14 +83,13 @@ class Cursor:
         return bits(self.data, self.skip(count // 8), count)
 
     def text(self, max_bytes: int = _MAX_NAME_BYTES) -> str:
-        """Reads a string."""
         length = self.number("<I")
         if length > max_bytes:
             raise ValueError(f"has a name of {length} bytes")
         return self.take(length).decode("utf-8", "replace")
 
     def metadata(self) -> dict[str, Any]:
-        """Reads metadata; values of unknown types are left out."""
+        """Reads metadata; only strings and boxes' corners are kept."""
         metadata: dict[str, Any] = {}
         count = self.number("<I")
         if count > _MAX_METADATA:
@@ -112,9 +100,8 @@ class Cursor:
             value = self.take(size)
             if kind == "string":
                 metadata[name] = value.decode("utf-8", "replace")
-            elif kind in _METADATA_LAYOUTS and struct.calcsize(_METADATA_LAYOUTS[kind]) == size:
-                numbers = struct.unpack(_METADATA_LAYOUTS[kind], value)
-                metadata[name] = numbers if len(numbers) > 1 else numbers[0]
+            elif kind == "vec3i" and size == 12:
+                metadata[name] = struct.unpack("<3i", value)
         return metadata
 
 
@@ -185,10 +172,8 @@ def _kind(grid: GridDescriptor) -> str:
     """Returns the type of a grid's values."""
     match = re.fullmatch(r"Tree_(\w+?)_5_4_3", grid.tree_type)
     if match is None or match[1] not in _TYPES:
-        raise ValueError(
-            f"grid {grid.name!r} is a {grid.tree_type}; "
-            f"known are trees 5_4_3 of {', '.join(_TYPES)}"
-        )
+        known = f"known are trees 5_4_3 of {', '.join(_TYPES)}"
+        raise ValueError(f"grid {grid.name!r} is a {grid.tree_type}; {known}")
     return match[1]
 
 
@@ -199,9 +184,7 @@ def _read_descriptors(data: Any) -> tuple[int, list[GridDescriptor]]:
     if magic != _MAGIC:
         raise ValueError("does not start like a VDB file")
     if version not in _VERSIONS:
-        raise ValueError(
-            f"is of file version {version}; {_VERSIONS[0]} to {_VERSIONS[-1]} are known"
-        )
+        raise ValueError(f"is of file version {version}; known: {_VERSIONS[0]} to {_VERSIONS[-1]}")
     cursor.skip(8)  # version of the library
     has_offsets = cursor.number("<?")
     is_zipped = cursor.number("<?") if version < _MASKED_VERSION else False
@@ -224,10 +207,8 @@ def _read_descriptors(data: Any) -> tuple[int, list[GridDescriptor]]:
                 f"a grid from {start} to {end}, its leaves at {leaves_start}, in a file of "
                 f"{len(data)} bytes; expected in this order, from {descriptor_end} on"
             )
-        is_half = tree.endswith("_HalfFloat")
-        grid = GridDescriptor(
-            unique, tree.removesuffix("_HalfFloat"), is_half, parent, start, leaves_start, end
-        )
+        kind, is_half = tree.removesuffix("_HalfFloat"), tree.endswith("_HalfFloat")
+        grid = GridDescriptor(unique, kind, is_half, parent, start, leaves_start, end)
         grid.compression = _ZIP if is_zipped else 0
         grids.append(grid)
         cursor.offset = end  # the descriptor of the next grid
@@ -348,15 +329,13 @@ class VdbGrid(SparseGrid):
         if (buffers := cursor.number("<I")) != 1:
             raise ValueError(f"grid {grid.name!r} has {buffers} buffers; expected 1")
         background = cursor.array(dtype, width)
-        stored_dtype = np.dtype("<f2") if grid.is_half and dtype.kind == "f" else dtype
-        compression = grid.compression
-        packing = _Packing(
-            stored_dtype, dtype, width, background, compression, version >= _MASKED_VERSION
-        )
-        topology = _Topology(cursor, packing).read(kind, grid.leaves_start)
-        return cls(
-            dtype=dtype, background=background, data=data, kind=kind, packing=packing, **topology
-        )
+        stored, has_masks = dtype, version >= _MASKED_VERSION
+        if grid.is_half and dtype.kind == "f":
+            stored = np.dtype("<f2")
+        packing = _Packing(stored, dtype, width, background, grid.compression, has_masks)
+        fields = _Topology(cursor, packing).read(kind, grid.leaves_start)
+        fields |= {"dtype": dtype, "background": background, "kind": kind, "packing": packing}
+        return cls(data=data, **fields)
 
     def tiles(self, level: int, number: int) -> tuple[np.ndarray, np.ndarray]:
         n = COUNTS[level]
@@ -405,10 +384,8 @@ class _Topology:
             self._node(0, np.array(cursor.numbers("<3i"), np.int64))
         none = np.zeros((0, 3), np.int64)
         active_counts = np.concatenate([none[:, 0], *self.leaf_active_counts])
-        if cursor.offset != leaves_start:
-            raise ValueError(
-                f"leaves begin at {leaves_start}, the nodes above end at {cursor.offset}"
-            )
+        if (end := cursor.offset) != leaves_start:
+            raise ValueError(f"leaves begin at {leaves_start}, the nodes above end at {end}")
         uppers, lowers = (np.array(part, np.int64) for part in self.inner_offsets)
         leaves = self._leaves(kind, active_counts.tolist())
         return {
@@ -441,15 +418,12 @@ class _Topology:
         cursor, offsets = self.cursor, np.empty(len(active_counts), np.int64)
         for number, count in enumerate(active_counts):
             offsets[number] = cursor.skip(VOXELS // 8)
-            if kind == "mask":
+            if kind in ("mask", "bool") or not self.packing.has_masks:
                 cursor.skip(12)
-            elif kind == "bool":
-                cursor.skip(12 + VOXELS // 8)
-            elif self.packing.has_masks:
-                self.packing.skip(cursor, count, VOXELS)
-            else:
-                cursor.skip(12)
-                if (buffers := cursor.number("<b")) != 1:
+            if kind == "bool":
+                cursor.skip(VOXELS // 8)
+            elif kind != "mask":
+                if not self.packing.has_masks and (buffers := cursor.number("<b")) != 1:
                     raise ValueError(f"a leaf has {buffers} buffers; expected 1")
                 self.packing.skip(cursor, count, VOXELS)
         return offsets

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -70,27 +70,16 @@ def read_page(page: Any, keyframe: Any, index: Index) -> np.ndarray:
         height, across = keyframe.tilelength, keyframe.tilewidth
     low, high = boxes.box_of(index[:2])
     out = np.zeros((*np.subtract(high, low), samples), keyframe.dtype)
-    with _opened(page.parent.filehandle):
+    file = page.parent.filehandle
+    with ExitStack() as stack:
+        if file.closed:  # tifffile closes those beside the one it opened: planes of an OME-TIFF
+            file.open()
+            stack.callback(file.close)
         for row, column in boxes.tile_indices(low, high, (height, across)):
             tile = _unpack_tile(page, keyframe, row * -(-width // across) + column)
             if tile is not None:
                 boxes.paste(out, low, tile, (row * height, column * across))
     return out[..., index[2]] if len(index) == 3 else out[..., 0]
-
-
-@contextmanager
-def _opened(file: Any) -> Iterator[None]:
-    """Opens a file for as long as it is needed: tifffile closes those beside the one it opened,
-    which hold further planes of an OME-TIFF.
-    """
-    was_closed = file.closed
-    if was_closed:
-        file.open()
-    try:
-        yield
-    finally:
-        if was_closed:
-            file.close()
 
 
 def _unpack_tile(page: Any, keyframe: Any, tile_number: int) -> np.ndarray | None:
@@ -116,8 +105,6 @@ def _unpack_tile(page: Any, keyframe: Any, tile_number: int) -> np.ndarray | Non
 def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
     with opened_tiff(path) as (file, log):
-        if not file.series:
-            raise ValueError("it holds no images")
         chosen, others = choose(path, "series", [item.name for item in file.series], key)
         series = file.series[chosen]
         shape = tuple(int(n) for n in series.shape)
@@ -131,11 +118,11 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
             fields |= {"dropped": tuple(dropped), "offset": int(series.dataoffset)}
             stored = series.dtype.newbyteorder(file.byteorder).str
             return ArraySource(file=path, stored=stored, **fields)
-        page_shape = tuple(series.keyframe.shape)
-        leading = len(shape) - len(page_shape)
-        by_page = shape[leading:] == page_shape and len(series.pages) == math.prod(shape[:leading])
-        by_page &= axes[leading:].replace("-", "") in ("yx", "yxc") and "-" not in axes[leading:]
         keyframe = series.keyframe
+        leading = len(shape) - len(keyframe.shape)
+        is_whole_pages = shape[leading:] == tuple(keyframe.shape)
+        by_page = is_whole_pages and len(series.pages) == math.prod(shape[:leading])
+        by_page &= axes[leading:] in ("yx", "yxc")
         piece_values = int(np.prod(keyframe.chunks)) if by_page else math.prod(shape)
         if series.is_multifile:
             handles = (page.parent.filehandle for page in series.pages if page is not None)
@@ -143,10 +130,8 @@ def open_tiff(path: str, key: str | None = None) -> VolumeSource:
         missing_pages = sum(page is None for page in series.pages)
         if missing_pages:
             dropped.append(f"{missing_pages} of {len(series.pages)} pages, which are not there")
-    fields["unpacked_bytes"] = piece_values * series.dtype.itemsize
-    return TiffSource(
-        stored=series.dtype.str, whole=not by_page, series=chosen, dropped=tuple(dropped), **fields
-    )
+    fields |= {"dropped": tuple(dropped), "unpacked_bytes": piece_values * series.dtype.itemsize}
+    return TiffSource(stored=series.dtype.str, whole=not by_page, series=chosen, **fields)
 
 
 def _axes(path: str, shape: Sequence[int], axes: str) -> str:
@@ -161,9 +146,8 @@ def _axes(path: str, shape: Sequence[int], axes: str) -> str:
         axis_order, other_axes = axis_order.replace(other_axes[0], "Z"), []
     channels = [letter for letter in axis_order if letter in "CS"]
     if other_axes or len(channels) > 1 or axis_order.count("Y") != 1 or axis_order.count("X") != 1:
-        raise ValueError(
-            f"{path}: axes {axes} {tuple(shape)}; expected T, Z, Y, X and at most one of C, S"
-        )
+        expected = "T, Z, Y, X and at most one of C, S"
+        raise ValueError(f"{path}: axes {axes} {tuple(shape)}; expected {expected}")
     return axis_order.replace("S", "C").lower()
 
 

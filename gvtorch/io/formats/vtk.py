@@ -40,7 +40,6 @@ _COMPRESSORS = {
 }
 _MAX_HEADER_BYTES = 1 << 22
 _MAX_INLINE_BYTES = 1 << 31  # of a file whose numbers are inside its XML
-_MAX_VALUES = 1 << 33
 _MAX_ARRAYS = 64
 _MAX_LINE_BYTES = 4096  # of a line that are parsed
 _ARRAY_KEYWORDS = ("SCALARS", "VECTORS", "COLOR_SCALARS")
@@ -89,10 +88,8 @@ class VtkSource(VolumeSource):
         table_bytes = (3 + block_count) * item_bytes
         _, block_size, last_size, *packed_sizes = self._sizes(content, 3 + block_count)
         unpacked_sizes = [block_size] * (block_count - 1) + [last_size or block_size]
-        if sum(unpacked_sizes) != needed_bytes:
-            raise ValueError(
-                f"{self.path}: {needed_bytes} bytes expected, {sum(unpacked_sizes)} found"
-            )
+        if (found := sum(unpacked_sizes)) != needed_bytes:
+            raise ValueError(f"{self.path}: {needed_bytes} bytes expected, {found} found")
         if sum(packed_sizes) > len(content):
             raise ValueError(f"{self.path}: ends before its {sum(packed_sizes)} packed bytes")
         # The table and the blocks are each encoded as one stretch of base64.
@@ -131,15 +128,10 @@ def _extent(points: Sequence[int], cells: bool) -> list[int]:
 
 
 def _source_fields(
-    path: str,
-    points: Sequence[int],
-    affine: np.ndarray,
-    array: dict[str, Any],
-    dropped: tuple[str, ...],
+    path: str, points: Sequence[int], affine: np.ndarray, array: dict[str, Any]
 ) -> dict[str, Any]:
     """Returns the fields of a source of (z, y, x) or (z, y, x, c) values at points, or in cells."""
     size = _extent(points, array["cells"])
-    check_extent(path, size, max_values=_MAX_VALUES)
     if array["cells"]:
         affine = affine.copy()
         half_voxel = [0.5 * (n > 1) for n in points]
@@ -151,7 +143,6 @@ def _source_fields(
         "path": path,
         "shape": (*size[::-1], *((width,) if width > 1 else ())),
         "info": ImageInfo(channels=(ChannelInfo(name=array["name"]),) if width == 1 else ()),
-        "dropped": dropped,
         **placement,
     }
 
@@ -162,9 +153,16 @@ def _source_fields(
 def _open_xml(path: str, key: str | None) -> VolumeSource:
     xml, appended = _read_xml(path)
     root = ElementTree.fromstring(xml)
-    image, piece = _image_and_piece(path, root)
-    affine, points = _xml_grid(path, image, piece)
-    arrays = _xml_arrays(root, piece)
+    image = root.find("ImageData")
+    if root.get("type") == "ImageData" and image is None:
+        raise ValueError(f"{path}: has no ImageData in it")
+    if root.tag != "VTKFile" or image is None:
+        raise ValueError(f"{path}: is not ImageData, but {root.get('type', root.tag)!r}")
+    pieces = image.findall("Piece")
+    if len(pieces) != 1:
+        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
+    affine, points = _xml_grid(path, image, pieces[0])
+    arrays = _xml_arrays(root, pieces[0])
     chosen, dropped = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
     if (number_dtype := number_type(array["kind"])) is None:
@@ -172,29 +170,28 @@ def _open_xml(path: str, key: str | None) -> VolumeSource:
     byte_order = _BYTE_ORDERS[root.get("byte_order", "LittleEndian")]
     size_dtype = byte_order + _SIZE_DTYPES[root.get("header_type", "UInt32")]
     compressor = _COMPRESSORS[root.get("compressor", "")]
-    fields = _source_fields(path, points, affine, array, dropped)
-    fields["stored"] = byte_order + number_dtype
-    encoding, offset = _xml_place(path, appended, array)
-    if encoding == "raw" and offset is not None and not compressor:
-        return ArraySource(file=path, offset=offset + np.dtype(size_dtype).itemsize, **fields)
-    return VtkSource(
-        encoding=encoding,
-        compressor=compressor,
-        size_dtype=size_dtype,
-        number=array["number"],
-        offset=offset,
-        **fields,
-    )
+    fields = _source_fields(path, points, affine, array)
+    fields |= {"stored": byte_order + number_dtype, "dropped": dropped}
+    offset, encoding = None, "ascii" if array["format"] == "ascii" else "base64"
+    if array["format"] == "appended":
+        if appended is None:
+            raise ValueError(f"{path}: has no appended data")
+        offset, size = appended.end() + array["offset"], os.stat(path).st_size
+        if offset >= size:
+            name = array["name"]
+            raise ValueError(f"{path}: {name} begins at {offset}, the file has {size} bytes")
+        encoding = "base64" if b"base64" in appended.group() else "raw"
+        if encoding == "raw" and not compressor:
+            return ArraySource(file=path, offset=offset + np.dtype(size_dtype).itemsize, **fields)
+    fields |= {"encoding": encoding, "compressor": compressor, "size_dtype": size_dtype}
+    return VtkSource(number=array["number"], offset=offset, **fields)
 
 
 def _read_xml(path: str) -> tuple[bytes, re.Match[bytes] | None]:
-    """Returns a file's XML without appended data, and a match that ends where these begin, if any.
-    Numbers may be inside the XML.
-    """
+    """Returns a file's XML, and a match that ends where appended data begin, if there are any."""
     with open(path, "rb") as file:
         content = file.read(_MAX_HEADER_BYTES)
-        # Matched at the first tag only: with many tags that never end, time would grow as their
-        # square.
+        # At the first tag only: with many tags that never end, time would grow as their square.
         start = content.find(b"<AppendedData")
         tag = re.compile(rb"<AppendedData\b[^>]*>\s*_")
         appended = tag.match(content, start) if start >= 0 else None
@@ -202,16 +199,12 @@ def _read_xml(path: str) -> tuple[bytes, re.Match[bytes] | None]:
             return content[: appended.start()] + b"</VTKFile>", appended
         size = os.stat(path).st_size
         if size > _MAX_INLINE_BYTES:
-            raise ValueError(
-                f"{path}: {size} bytes of XML are too many; write it with appended data"
-            )
+            raise ValueError(f"{path}: {size} bytes of XML are too many; write appended data")
         return content + file.read(), None
 
 
 def _xml_grid(path: str, image: Any, piece: Any) -> tuple[np.ndarray, list[int]]:
-    """Returns (4, 4) the affine from the piece's points to the world, and their number along x, y
-    and z.
-    """
+    """Returns (4, 4) from the piece's points to the world, and their number along x, y and z."""
 
     def numbers(name: str, default: str) -> np.ndarray:
         return np.array([float(number) for number in image.get(name, default).split()])
@@ -225,19 +218,6 @@ def _xml_grid(path: str, image: Any, piece: Any) -> tuple[np.ndarray, list[int]]
     affine[:3, :3] = direction * numbers("Spacing", "1 1 1")
     affine[:3, 3] = numbers("Origin", "0 0 0") + affine[:3, :3] @ low
     return affine, [b - a + 1 for a, b in zip(low, high, strict=True)]
-
-
-def _image_and_piece(path: str, root: Any) -> tuple[Any, Any]:
-    """Returns the ImageData of a file, and its only piece."""
-    image = root.find("ImageData")
-    if root.get("type") == "ImageData" and image is None:
-        raise ValueError(f"{path}: has no ImageData in it")
-    if root.tag != "VTKFile" or image is None:
-        raise ValueError(f"{path}: is not ImageData, but {root.get('type', root.tag)!r}")
-    pieces = image.findall("Piece")
-    if len(pieces) != 1:
-        raise ValueError(f"{path}: has {len(pieces)} pieces; expected one")
-    return image, pieces[0]
 
 
 def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
@@ -265,21 +245,6 @@ def _xml_arrays(root: Any, piece: Any) -> list[dict[str, Any]]:
     return sorted(arrays, key=lambda array: not array["first"])
 
 
-def _xml_place(
-    path: str, appended: re.Match[bytes] | None, array: dict[str, Any]
-) -> tuple[str, int | None]:
-    """Returns how an array is encoded, and where it begins in the file if its data are appended."""
-    if array["format"] != "appended":
-        return "ascii" if array["format"] == "ascii" else "base64", None
-    if appended is None:
-        raise ValueError(f"{path}: has no appended data")
-    offset = appended.end() + array["offset"]
-    size = os.stat(path).st_size
-    if offset >= size:
-        raise ValueError(f"{path}: {array['name']} begins at {offset}, the file has {size} bytes")
-    return "base64" if b"base64" in appended.group() else "raw", offset
-
-
 # --- legacy
 
 
@@ -296,8 +261,9 @@ def _open_legacy(path: str, key: str | None) -> VolumeSource:
         affine, points, arrays = _legacy_parts(path, content, header_bytes, binary)
     chosen, dropped = choose(path, "array", [array["name"] for array in arrays], key)
     array = arrays[chosen]
-    fields = _source_fields(path, points, affine, array, dropped)
+    fields = _source_fields(path, points, affine, array)
     fields |= {"file": path, "offset": array["offset"], "stored": array["stored"]}
+    fields["dropped"] = dropped
     if binary:
         return ArraySource(**fields)
     return TextSource(fractions=array["colors"], **fields)
@@ -350,7 +316,6 @@ def _legacy_type(name: str) -> str:
 def _legacy_array(
     path: str, tokens: list[str], points: Sequence[int], cells: bool
 ) -> dict[str, Any]:
-    """Returns the description of an array from its header line."""
     kind = tokens[0].upper()
     if kind == "COLOR_SCALARS":
         name, dtype, width = tokens[1].replace("%%", "%"), "u1", int(tokens[2])  # VTK doubles the %
@@ -361,7 +326,7 @@ def _legacy_array(
         width = 3 if kind == "VECTORS" else int(tokens[3]) if len(tokens) > 3 else 1
     if not dtype:
         raise ValueError(f"{path}: {' '.join(tokens)[:80]!r} is not an array of numbers")
-    check_extent(path, (*points, width), max_values=_MAX_VALUES)
+    check_extent(path, (*points, width), max_values=1 << 62)
     nbytes = math.prod(_extent(points, cells)) * width * np.dtype(dtype).itemsize
     return {
         "name": unquote(name),

@@ -261,7 +261,6 @@ def needed_cells(cells: np.ndarray, threshold: float | None) -> np.ndarray:
 
 
 def _zero_rows(out: np.ndarray) -> list[int]:
-    """Returns the rows that are all zero."""
     rows = out.reshape(len(out), -1)
     candidates = np.flatnonzero(~rows[:, :64].any(1)).tolist()
     return [row for row in candidates if not rows[row].any()]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,9 +76,7 @@ def convert_channels(
     if len(grids) != 1:
         raise ValueError(f"a store's channels must be of one grid, got {len(grids)}")
     if invalid := [name for name in sources if not is_name(name)]:
-        raise ValueError(
-            f"a channel's name is made of letters, digits, - and _, got {invalid[0]!r}"
-        )
+        raise ValueError(f"a channel's name has letters, digits, - and _ only, got {invalid[0]!r}")
     unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
     with unfinished.claimed_folder(target):
         _write_channels(sources, target, resume, progress, options)
@@ -94,25 +93,23 @@ def _write_channels(
     """Writes the channels into a folder that no other process writes to."""
     begun = unfinished.is_begun(target, resume=resume, manifest=_MANIFEST)
     manifest = target / WORK / _MANIFEST
-    fingerprints = unfinished.as_json(
-        {name: source.fingerprint() for name, source in sources.items()}
-    )
-    if begun and read_json_file(manifest) != {"sources": fingerprints}:
+    fingerprints = {name: source.fingerprint() for name, source in sources.items()}
+    content = unfinished.as_json({"sources": fingerprints})
+    if begun and read_json_file(manifest) != content:
         raise ValueError(
             f"{target}: was begun with another source, other channels or other settings; remove "
             "the store to begin again"
         )
-    unfinished.write_json(manifest, {"sources": fingerprints})
+    unfinished.write_json(manifest, content)
     total, done = sum(source.nbytes for source in sources.values()), 0
     for name, source in sources.items():
-        if not unfinished.is_finished(target / name):
-            is_half_written = unfinished.is_half_written(target / name)
-            if not is_half_written:
-                shutil.rmtree(target / name, ignore_errors=True)
-            channel_progress = _channel_progress(progress, done, source.nbytes, total)
-            convert(
-                source, target / name, resume=is_half_written, progress=channel_progress, **options
-            )
+        folder = target / name
+        if not unfinished.is_finished(folder):
+            half_written = unfinished.is_half_written(folder)
+            if not half_written:
+                shutil.rmtree(folder, ignore_errors=True)
+            report = partial(_report_share, progress, done, source.nbytes, total)
+            convert(source, folder, resume=half_written, progress=report, **options)
         done += source.nbytes
         progress("converting", done, total)
     (target / "OME").mkdir(exist_ok=True)
@@ -123,12 +120,8 @@ def _write_channels(
     shutil.rmtree(target / WORK, ignore_errors=True)
 
 
-def _channel_progress(
-    progress: Progress, done_before: int, channel_bytes: int, total: int
-) -> Progress:
-    """Returns a callback that maps one channel's progress to the progress of all channels."""
-
-    def report(stage: str, done: int, channel_total: int) -> None:
-        progress(stage, done_before + channel_bytes * done // max(channel_total, 1), total)
-
-    return report
+def _report_share(
+    progress: Progress, before: int, size: int, total: int, stage: str, done: int, parts: int
+) -> None:
+    """Reports the progress of one channel as that of all."""
+    progress(stage, before + size * done // max(parts, 1), total)

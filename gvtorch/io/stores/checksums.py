@@ -86,24 +86,23 @@ class Checksums:
         if self._checksums is None:
             self._checksums = self._read_list(deadline)
         expected = self._checksums.get(path)
-        context = f"{self._location}/{path}"
         if expected is not None:  # None: no file was written, so there is nothing to compare
             content = _read_covered_bytes(self._location, self._root, spec, path, deadline)
             if content is None:
                 return  # it reads as zeros, and the store then finds out why
             if zlib.crc32(content) != expected:
+                context = f"{self._location}/{path}"
                 raise StoreError(f"{context}: its checksum is not the one that was written")
         self._checked_paths.add(path)
 
     def _read_list(self, deadline: Deadline) -> Mapping[str, Any]:
+        location, root, max_bytes = self._location, self._root, self._max_list_bytes
         try:
-            content = read_json(
-                self._location, self._root, CHECKSUMS_FILE, deadline, self._max_list_bytes
-            )
+            content = read_json(location, root, CHECKSUMS_FILE, deadline, max_bytes)
         except ValueError as error:
             raise StoreError(str(error)) from None
         checksums = None if content is None else content.get("files")
         if not isinstance(checksums, dict) or json_checksum(checksums) != self._list_checksum:
             problem = "is missing" if content is None else "is not the one that was written"
-            raise StoreError(f"{self._location}/{CHECKSUMS_FILE}: {problem}")
+            raise StoreError(f"{location}/{CHECKSUMS_FILE}: {problem}")
         return checksums

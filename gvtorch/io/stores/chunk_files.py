@@ -141,21 +141,17 @@ class ChunkFiles:
         file = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
         key_encoding = metadata.get("chunk_key_encoding", {"name": "default"})
         is_default = key_encoding["name"] == "default"
-        separator = key_encoding.get("configuration", {}).get(
-            "separator", "/" if is_default else "."
-        )
+        settings = key_encoding.get("configuration", {})
+        separator = settings.get("separator", "/" if is_default else ".")
         codecs, shard = metadata["codecs"], dict[str, Any](chunk=file)
         if codecs[-1]["name"] == "sharding_indexed":
             inner = codecs[-1]["configuration"]
-            index = inner["index_codecs"]
-            is_big_endian = any(
-                codec.get("configuration", {}).get("endian") == "big" for codec in index
-            )
+            index = {c["name"]: c.get("configuration", {}) for c in inner["index_codecs"]}
             shard = {
                 "chunk": tuple(inner["chunk_shape"]),
                 "index": inner.get("index_location", "end"),
-                "order": ">" if is_big_endian else "<",
-                "summed": any(codec["name"] == "crc32c" for codec in index),
+                "order": ">" if index.get("bytes", {}).get("endian") == "big" else "<",
+                "summed": "crc32c" in index,
                 "transposed": len(codecs) > 1,
             }
             codecs = inner["codecs"]
@@ -205,9 +201,7 @@ class ChunkFiles:
         return indices
 
     def entries(self, index: bytes) -> np.ndarray:
-        """Returns (n, 2) uint64 offset and length of chunks in a shard, parsed from its index or
-        from some entries.
-        """
+        """Returns (n, 2) uint64 offset and length of chunks, from a shard's index or a part."""
         numbers = np.frombuffer(index, f"{self.order}u8", len(index) // _ENTRY_BYTES * 2)
         return numbers.astype(np.uint64).reshape(-1, 2)
 
@@ -219,9 +213,9 @@ class ChunkFiles:
             Endless: A file is not a regular one, or is too long, or Blosc would unpack too much.
         """
         chunks = part if isinstance(part, np.ndarray) else self._chunks_of_part(part)
-        count, strides = self._counts_and_strides
+        count = np.floor_divide(self.file, self._counted)  # chunks of a file along each axis
         files = chunks // count
-        numbers = (chunks - files * count) @ strides
+        numbers = (chunks - files * count) @ (np.cumprod(count[::-1])[::-1] // count)
         for file_index, rows in zip(*group_rows(files), strict=True):
             name = f"{self.begin}{self.separator.join(map(str, file_index.tolist()))}"
             try:
@@ -243,15 +237,12 @@ class ChunkFiles:
         if not self.blosc:
             return
         if entries is None:
-            self._check_blosc_headers(
-                [content[self._blosc_offset(content) :][:_BLOSC_HEADER_BYTES]] if begin == 0 else []
-            )
-            return
-        last = begin + len(content) - _BLOSC_HEADER_BYTES
-        starts = entries[(entries[:, 0] >= begin) & (entries[:, 0] <= max(last, 0)), 0].tolist()
-        self._check_blosc_headers(
-            [content[start - begin : start - begin + _BLOSC_HEADER_BYTES] for start in starts]
-        )
+            starts = [self._blosc_offset(content)] if begin == 0 else []
+        else:
+            last = begin + len(content) - _BLOSC_HEADER_BYTES
+            sent = entries[(entries[:, 0] >= begin) & (entries[:, 0] <= max(last, 0)), 0]
+            starts = [start - begin for start in sent.tolist()]
+        self._check_blosc_headers(content[s : s + _BLOSC_HEADER_BYTES] for s in starts)
 
     @property
     def _counted(self) -> tuple[int, ...]:
@@ -260,16 +251,8 @@ class ChunkFiles:
         """
         return self.file if self.transposed else self.chunk
 
-    @cached_property
-    def _counts_and_strides(self) -> tuple[np.ndarray, np.ndarray]:
-        """(axes,) chunks of a file along each axis, and the stride of a chunk's number in it."""
-        count = np.floor_divide(self.file, self._counted)
-        return count, np.cumprod(count[::-1])[::-1] // count
-
     def _chunks_of_part(self, transform: Any) -> np.ndarray:
-        """Returns (n, axes) indices of the chunks that hold the part of the array that an
-        IndexTransform of tensorstore maps.
-        """
+        """Returns (n, axes) indices of the chunks that an IndexTransform maps a part to."""
         origin, shape = transform.input_origin, transform.input_shape
         spans, indexed = dict[int, np.ndarray](), dict[int, np.ndarray]()
         for axis, (output, n) in enumerate(zip(transform.output, self._counted, strict=True)):
@@ -300,10 +283,7 @@ class ChunkFiles:
             return  # tensorstore reports the error
         try:
             if not self.index:
-                content = os.pread(file, 64 + 4 * len(self.file), 0)
-                self._check_blosc_headers(
-                    [content[self._blosc_offset(content) :][:_BLOSC_HEADER_BYTES]]
-                )
+                self.check_sent(0, os.pread(file, 64 + 4 * len(self.file), 0), None)
                 return
             low, high = int(chunks.min()), int(chunks.max()) + 1
             entry_start = _ENTRY_BYTES * low
@@ -314,9 +294,7 @@ class ChunkFiles:
             entries = self.entries(os.pread(file, _ENTRY_BYTES * (high - low), entry_start))
             starts = entries[chunks[chunks - low < len(entries)] - low, 0]
             starts = starts[starts < _MISSING_OFFSET].tolist()
-            self._check_blosc_headers(
-                [os.pread(file, _BLOSC_HEADER_BYTES, start) for start in starts]
-            )
+            self._check_blosc_headers(os.pread(file, _BLOSC_HEADER_BYTES, s) for s in starts)
         finally:
             os.close(file)
 
@@ -328,13 +306,10 @@ class ChunkFiles:
 
     def _check_blosc_headers(self, headers: Iterable[bytes]) -> None:
         max_bytes = 2 * self.chunk_bytes + _ENTRY_BYTES
-        unpacked_sizes = np.frombuffer(
-            b"".join(header for header in headers if len(header) == _BLOSC_HEADER_BYTES), "<u4"
-        )[1::2]
-        if (unpacked_sizes > max_bytes).any():
+        sizes = [int.from_bytes(h[4:], "little") for h in headers if len(h) == _BLOSC_HEADER_BYTES]
+        if (size := max(sizes, default=0)) > max_bytes:
             raise Endless(
-                f"Blosc would make {unpacked_sizes.max()} bytes of a chunk, more than the "
-                f"{max_bytes} that fit"
+                f"Blosc would make {size} bytes of a chunk, more than the {max_bytes} that fit"
             )
 
 

@@ -27,7 +27,7 @@ from ..resources import amount
 from .ngff import read_json_file
 from .shard import begin_write, bordered, create_array, finish_write
 from .store import Store
-from .store_layout import BORDER, WORK, CoarseChannel, StoreLayout, is_name
+from .store_layout import BORDER, WORK, CoarseChannel, is_name
 from .unfinished import group_metadata, locked, write_json
 
 _CUBE_SIDE = 128  # voxels along a side of the cubes that are written at once
@@ -98,16 +98,13 @@ def make_channel(
 
 @contextmanager
 def _levels_in_files(store: Store, fill_width: int) -> Iterator[Sequence[np.ndarray]]:
-    """Yields an array for each coarse level, mapped from temporary files in the folder that is
-    locked.
-    """
+    """Yields an array for each coarse level, mapped from temporary files."""
     folder = Path(store.location) / store.coarse_folder / WORK
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
+    levels = range(1, store.levels)
     try:
-        yield [
-            _map_level_file(store, folder, level, fill_width) for level in range(1, store.levels)
-        ]
+        yield [_map_level_file(store, folder, level, fill_width) for level in levels]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -138,33 +135,21 @@ def _write_blocks(
     channel_folder = Path(store.location) / store.coarse_folder / folder
     shutil.rmtree(channel_folder, ignore_errors=True)  # left by interrupted work
     channel_folder.mkdir()
+    block = store.layout.block
     done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
         create_array(store.root, spec)
         for low in itertools.product(*(range(0, n, _CUBE_SIDE) for n in values.shape[:3])):
             size = [min(_CUBE_SIDE, n - a) for a, n in zip(low, values.shape, strict=False)]
-            blocks = _blocks(store.layout, values, low, size, to_values)
-            first_block = [a // store.layout.block for a in low]
-            finish_write(
-                begin_write(store.root, spec, first_block, blocks), store.location, "make it again"
-            )
+            padded_size = np.multiply(-(-np.array(size) // block), block)
+            begin, end = np.subtract(low, BORDER).tolist(), (low + padded_size + BORDER).tolist()
+            start, stop = boxes.clamped_box(begin, end, values.shape[:3])
+            inside = to_values(values[boxes.index(start, stop)])
+            blocks = bordered(store.layout, boxes.repeat_edges(inside, start, begin, end))
+            first_block = [a // block for a in low]
+            future = begin_write(store.root, spec, first_block, np.ascontiguousarray(blocks))
+            finish_write(future, store.location, "make it again")
             done += math.prod(size)
             progress("writing", done, total)
     write_json(channel_folder / "zarr.json", group_metadata({}))
-
-
-def _blocks(
-    layout: StoreLayout,
-    values: np.ndarray,
-    low: Sequence[int],
-    size: Sequence[int],
-    to_values: Callable[[np.ndarray], np.ndarray],
-) -> np.ndarray:
-    """Returns (gz, gy, gx, s, s, s, c) blocks of a cube of a level, borders included."""
-    padded_size = np.multiply(-(-np.array(size) // layout.block), layout.block)
-    begin = np.subtract(low, BORDER).tolist()
-    end = (low + padded_size + BORDER).tolist()
-    start, stop = boxes.clamped_box(begin, end, values.shape[:3])
-    padded = boxes.repeat_edges(to_values(values[boxes.index(start, stop)]), start, begin, end)
-    return np.ascontiguousarray(bordered(layout, padded))

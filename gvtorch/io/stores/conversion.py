@@ -35,7 +35,7 @@ from .conversion_plan import (
     source_of,
 )
 from .store import Store
-from .store_layout import RESUME_ADVICE, WORK
+from .store_layout import JOURNAL, RESUME_ADVICE, WORK
 from .tensorstores import Deadline, begin_open
 
 _TASKS_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
@@ -218,7 +218,8 @@ def _explain_resume(plan: Plan) -> Iterator[None]:
             f'that converts outside of `if __name__ == "__main__":`); {RESUME_ADVICE}'
         ) from None
     except KeyboardInterrupt:
-        done = unfinished.count_done(target)
+        journal = target / WORK / JOURNAL
+        done = journal.read_bytes().count(b"\n") if journal.exists() else 0
         raise KeyboardInterrupt(
             f"{target}: interrupted, {done} of {plan.settings['tasks']} shards are done; "
             f"{RESUME_ADVICE}"

@@ -109,9 +109,8 @@ def source_of(
             raise ValueError(f"{source.name}: {source.data.dtype} can't be stored")
         fields = {"path": source.name, "info": source.info}
         fields |= {"spacing": source.spacing, "origin": source.origin}
-        opened = with_placement(
-            "convert", MemorySource.of(source.data.cpu().numpy(), **fields), spacing, origin
-        )
+        values = MemorySource.of(source.data.cpu().numpy(), **fields)
+        opened = with_placement("convert", values, spacing, origin)
         if source.label_values is None:
             return opened
         # The volume's labels are indexed already.
@@ -157,19 +156,16 @@ def plan_of(
         times=source.times if time is None else 1,
         label_count=None if label_values is None else len(label_values),
     )
-    info_channels = len(source.info.channels)
-    if info_channels not in (0, source.width):
-        raise ValueError(
-            f"{source.path}: its info names {info_channels} channels, it has {source.width}"
-        )
+    named = len(source.info.channels)
+    if named not in (0, source.width):
+        raise ValueError(f"{source.path}: its info names {named} channels, it has {source.width}")
     workers = resources.cores() if workers is None else workers
     workers = check.integer("convert", "workers", workers, low=1)
     tasks = [layout.times * math.prod(layout.shards(level)) for level in range(layout.levels)]
-    fields = ("extent", "dtype", "spacing", "origin")
     settings = {
         "source": source.path,
         "fingerprint": _fingerprint(user_source, source, target),
-        **{name: getattr(source, name) for name in fields},
+        **{name: getattr(source, name) for name in ("extent", "dtype", "spacing", "origin")},
         "unit": source.info.unit,
         "times": layout.times,
         "time": source.time,

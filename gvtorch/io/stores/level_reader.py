@@ -70,11 +70,10 @@ def open_arrays(
     time: int,
     channels: Sequence[int] | None,
     deadline: Deadline,
-) -> tuple[list[StoredArray], slice | list[int], dict[str, int]]:
+) -> tuple[list[StoredArray], slice | list[int], int]:
     """Opens the image's arrays, the finest first, at one time point, without those that are not
     coarser by whole factors, or whose place, dtype, times or channels differ. Returns them, the
-    index of their channels, and the image's size along each axis. Metadata is checked before memory
-    is allocated.
+    index of their channels, and the number of times. Reduces the image's metadata to the channels.
     """
     finest = image.scales[0]
     folder = child(root, finest.path)
@@ -104,10 +103,11 @@ def open_arrays(
         factors = _factors(stored[0], opened, finest, scale) if stored else opened.factors
         if factors is not None:
             stored.append(replace(opened, factors=factors))
-    return stored, channel_index, sizes
+    _keep_channels(image, sizes, channel_index)
+    return stored, channel_index, sizes.get("t", 1)
 
 
-def keep_channels(
+def _keep_channels(
     image: MultiscaleImage, sizes: dict[str, int], channel_index: slice | list[int]
 ) -> None:
     """Reduces the channel metadata to the chosen channels; drops it if it doesn't fit the array."""
@@ -208,7 +208,12 @@ class LevelReader:
     def _read_inside(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
         plan = self._plans[level]
         if plan is None:
-            return self._read_tiles(level, low, high, deadline)
+            size = [b - a for a, b in zip(low, high, strict=True)]
+            out = np.empty((*size, self.width), self._layout.dtype)
+            for tile_index in boxes.tile_indices(low, high, [_TILE_SIDE] * 3):
+                tile = self._tile(level, tile_index, deadline)
+                boxes.paste(out, low, tile, [_TILE_SIDE * i for i in tile_index])
+            return out
         base, remaining = plan
         base_shape = [-(-n // f) for n, f in zip(self._layout.shape(0), base.factors, strict=True)]
         start = [a * r for a, r in zip(low, remaining, strict=True)]
@@ -218,14 +223,6 @@ class LevelReader:
             check_narrowed(base.context, data)
         data = data.astype(self._layout.dtype, copy=False)
         return data if math.prod(remaining) == 1 else self._pool(data, remaining)
-
-    def _read_tiles(self, level: int, low: Zyx, high: Zyx, deadline: Deadline) -> np.ndarray:
-        size = [b - a for a, b in zip(low, high, strict=True)]
-        out = np.empty((*size, self.width), self._layout.dtype)
-        for tile_index in boxes.tile_indices(low, high, [_TILE_SIDE] * 3):
-            tile = self._tile(level, tile_index, deadline)
-            boxes.paste(out, low, tile, [_TILE_SIDE * i for i in tile_index])
-        return out
 
     def _tile(self, level: int, tile_index: Zyx, deadline: Deadline) -> np.ndarray:
         key = (level, *tile_index)

@@ -47,6 +47,7 @@ class MultiscaleImage:
     info: ImageInfo = field(default_factory=ImageInfo)
     dropped: list[str] = field(default_factory=list)  # phrases: metadata that is not kept
     store_json: dict[str, Any] = field(default_factory=dict)  # gvtorch's attributes, in its stores
+    layout: StoreLayout | None = None  # what they say, in its stores
 
 
 def is_zarr(path: str | Path) -> bool:
@@ -61,11 +62,11 @@ def is_zarr(path: str | Path) -> bool:
 
 def find_image(
     location: str, root: Any, image: str | None, deadline: Deadline
-) -> tuple[Any, MultiscaleImage, StoreLayout | None]:
+) -> tuple[Any, MultiscaleImage]:
     """Finds a multiscale image by its name, number or folder; None finds the first.
 
     Returns:
-        Its group's kvstore, its metadata, and its layout, which is None unless gvtorch wrote it.
+        Its group's kvstore, and its metadata.
 
     Raises:
         ValueError: There is no such image, or the metadata is damaged.
@@ -74,13 +75,13 @@ def find_image(
     if attributes is None:
         raise _no_store_error(location, root, deadline)
     group = attributes
-    pyramid, layout = _parse_group(location, group, image)
+    pyramid = _parse_image(location, group, image)
     if pyramid is None:
         folders = _image_folders(location, root, group, deadline) if image is None else [image]
         if ".." not in folders[0] and not folders[0].startswith("/"):
             root, inner = child(root, folders[0]), f"{location}/{folders[0]}"
             group = _attributes(inner, root, deadline) or {}
-            pyramid, layout = _parse_group(inner, group, None)
+            pyramid = _parse_image(inner, group, None)
             if pyramid is not None:
                 _note_other_images(pyramid, folders[1:])
     if pyramid is None:
@@ -90,11 +91,8 @@ def find_image(
         names = _image_names(attributes) if image is not None else []
         names_hint = f"; it holds {_join_some(names)}" if names else ""
         raise ValueError(f"{location}: has {problem} (NGFF multiscales){names_hint}{plate_hint}")
-    if layout is not None:
-        pyramid.store_json = group["gvtorch"]
-        pyramid.info = _stored_info(pyramid.store_json.get("info"), pyramid.info)
     pyramid.dropped += _label_notes(location, root, group, deadline)
-    return root, pyramid, layout
+    return root, pyramid
 
 
 def read_json(
@@ -115,9 +113,7 @@ def read_json(
 
 
 def parse_json(location: str, content: bytes, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
-    """Parses a JSON object; raises ValueError if it is damaged, not an object, or longer than
-    `max_bytes`.
-    """
+    """Parses a JSON object; raises ValueError if it is damaged, not an object, or too long."""
     if len(content) > max_bytes:
         raise ValueError(f"{location}: more than {max_bytes} bytes of JSON are too many")
     try:
@@ -160,30 +156,19 @@ def _no_store_error(location: str, root: Any, deadline: Deadline) -> Exception:
     manifest = read_json(location, work_folder, MANIFEST, deadline)
     if manifest is None:
         reason = refused(file_url(root, "zarr.json")) if isinstance(root, str) else ""
-        return ValueError(
-            f"{location}: not a store: has neither zarr.json nor .zattrs"
-            + (f" ({reason})" if reason else "")
-        )
+        note = f" ({reason})" if reason else ""
+        return ValueError(f"{location}: not a store: has neither zarr.json nor .zattrs{note}")
     done = (read_key(location, work_folder, JOURNAL, deadline) or b"").count(b"\n")
-    return ValueError(
-        f"{location}: half-written: {done} of {manifest.get('tasks', '?')} shards are done; "
-        f"{RESUME_ADVICE}"
-    )
-
-
-def _parse_group(
-    location: str, attributes: dict[str, Any], image: str | None
-) -> tuple[MultiscaleImage | None, StoreLayout | None]:
-    """Returns the image that `_parse_image` finds, and the layout of the group, if it has one."""
-    store_json = attributes.get("gvtorch")
-    layout = None if store_json is None else StoreLayout.parse(location, store_json)
-    return _parse_image(location, attributes, image), layout
+    shards = f"{done} of {manifest.get('tasks', '?')} shards are done"
+    return ValueError(f"{location}: half-written: {shards}; {RESUME_ADVICE}")
 
 
 def _parse_image(
     location: str, attributes: dict[str, Any], image: str | None
 ) -> MultiscaleImage | None:
     """Returns the image of this name or number from a group's attributes; None if not found."""
+    store_json = attributes.get("gvtorch")
+    layout = None if store_json is None else StoreLayout.parse(location, store_json)
     images = _ngff_attribute(attributes, "multiscales")
     if not isinstance(images, list) or not images:
         return None
@@ -197,6 +182,9 @@ def _parse_image(
                 pyramid.info = replace(pyramid.info, labels=True)
                 ignored = (name for name in ("colors", "properties") if labels.get(name))
                 pyramid.dropped += [f"{name} of the labels" for name in ignored]
+            if layout is not None:
+                pyramid.layout, pyramid.store_json = layout, attributes["gvtorch"]
+                pyramid.info = _stored_info(pyramid.store_json.get("info"), pyramid.info)
             others = [str(other.get("name", n)) for n, other in enumerate(images) if n != number]
             _note_other_images(pyramid, others if image is None else [])
             return pyramid
@@ -301,9 +289,8 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
             raise ValueError(
                 f"{location}: a dataset needs a path inside the store, got {brief(path)}"
             )
-        scale, translation = _parse_transforms(
-            location, dataset.get("coordinateTransformations"), axes, dropped
-        )
+        transforms = dataset.get("coordinateTransformations")
+        scale, translation = _parse_transforms(location, transforms, axes, dropped)
         time_scale, *zyx = (a * b for a, b in zip(scale, outer[0], strict=True))
         time_offset, *offsets = (m * s + o for m, s, o in zip(translation, *outer, strict=True))
         spacing, position = (
@@ -323,10 +310,8 @@ def _parse_multiscale(location: str, item: dict[str, Any], omero: Any) -> Multis
         time_origin=origin if "t" in axes else 0.0,
         time_unit=step_unit,
     )
-    image_name = name if isinstance(name, str) else "image"
-    return MultiscaleImage(
-        axes, tuple(scales), image_name, info, list(dict.fromkeys(dropped + damaged))
-    )
+    name = name if isinstance(name, str) else "image"
+    return MultiscaleImage(axes, tuple(scales), name, info, [*dict.fromkeys(dropped + damaged)])
 
 
 def _unit_factors(units: dict[str, str], dropped: list[str]) -> list[float]:
@@ -419,10 +404,8 @@ def image_metadata(
         listed = [{"type": kind, kind: numbers} for kind, numbers in transforms.items()]
         datasets.append({"path": str(level), "coordinateTransformations": listed})
     method = "mode" if info.labels else "mean"  # how coarse levels are made
-    ome: dict[str, Any] = {
-        "version": "0.5",
-        "multiscales": [{"name": name, "type": method, "axes": axes, "datasets": datasets}],
-    }
+    multiscale = {"name": name, "type": method, "axes": axes, "datasets": datasets}
+    ome: dict[str, Any] = {"version": "0.5", "multiscales": [multiscale]}
     extras: dict[str, Any] = {"quantity": info.quantity, "space": info.space, "labels": info.labels}
     extras["pose"] = info.pose
     if info.channels:
@@ -448,10 +431,9 @@ def _read_channels(omero: Any) -> tuple[tuple[ChannelInfo, ...], list[str]]:
                 dropped.append(f"{name} {brief(channel[name])} of channel {number}")
         if channel.get("inverted") is True:
             dropped.append(f"channel {number} is shown inverted")
-        label, active = channel.get("label"), channel.get("active")
-        name = label if isinstance(label, str) else "" if label is None else str(label)
-        is_active = active is not False
-        channels.append(ChannelInfo(name=name, color=color, window=window, active=is_active))
+        label, active = channel.get("label"), channel.get("active") is not False
+        name = "" if label is None else str(label)
+        channels.append(ChannelInfo(name=name, color=color, window=window, active=active))
     return tuple(channels), dropped
 
 

@@ -66,13 +66,11 @@ def write_shard(conversion: Conversion, level: int, index: ShardIndex) -> TaskRe
         lowest = highest = values
     else:
         values, lowest, highest = _pool_finer_level(conversion, level, time or 0, *box)
-    axes = layout.axes.removeprefix("t")
-    pyramid = _to_pyramid_axes(values[inner], axes)
-    writes = [begin_write(conversion.root, layout.pyramid(level), low, pyramid, time)]
-    for spec, bound in zip(layout.bounds(level), (lowest, highest), strict=False):
-        writes.append(
-            begin_write(conversion.root, spec, low, _to_pyramid_axes(bound[inner], axes), time)
-        )
+    writes = []
+    pyramids = (layout.pyramid(level), *layout.bounds(level))
+    for spec, part in zip(pyramids, (values, lowest, highest), strict=False):
+        data = np.moveaxis(part[inner], 3, 0) if "c" in layout.axes else part[inner][..., 0]
+        writes.append(begin_write(conversion.root, spec, low, data, time))
     reduction: Reduction = "min" if conversion.source.info.labels else "mean"  # a mean is no label
     cells = _cells(values, lowest, highest, [-(-n // CELL) for n in size], reduction)
     first = [a // CELL for a in low]
@@ -131,11 +129,6 @@ def _pool_finer_level(
     return [boxes.repeat_edges(values, start, low, high) for values in pooled]
 
 
-def _to_pyramid_axes(values: np.ndarray, axes: str) -> np.ndarray:
-    """Returns (z, y, x, c) with the pyramid's axes, czyx or zyx."""
-    return np.moveaxis(values, 3, 0) if "c" in axes else values[..., 0]
-
-
 def _cells(
     values: np.ndarray,
     lowest: np.ndarray,
@@ -160,10 +153,9 @@ def _blocks(layout: StoreLayout, values: np.ndarray, needed: np.ndarray) -> np.n
     needed_blocks = pool_max(needed[..., None], layout.block // CELL)[..., 0]
     if not needed_blocks.any():
         return None
-    blocks = np.zeros(
-        (*needed_blocks.shape, *[layout.bordered_side] * 3, layout.width), values.dtype
-    )
-    blocks[needed_blocks] = bordered(layout, values)[needed_blocks]
+    all_blocks = bordered(layout, values)
+    blocks = np.zeros(all_blocks.shape, values.dtype)
+    blocks[needed_blocks] = all_blocks[needed_blocks]
     return blocks
 
 
@@ -201,7 +193,6 @@ def finish_write(future: Any, context: str, advice: str = RESUME_ADVICE) -> None
 
 
 def create_arrays(conversion: Conversion, level: int) -> None:
-    """Creates the empty arrays of a level."""
     layout = conversion.layout
     arrays = (layout.pyramid(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
@@ -209,7 +200,6 @@ def create_arrays(conversion: Conversion, level: int) -> None:
 
 
 def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
-    """Writes the table of indexed labels."""
     root, spec = conversion.root, conversion.layout.labels()
     create_array(root, spec)
     finish_write(begin_write(root, spec, [0], labels), root.get("path", "store"))

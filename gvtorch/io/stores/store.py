@@ -21,7 +21,7 @@ from ...base.labels import counted
 from .block_reader import BlockReader, cut_blocks, wait_for_array
 from .checksums import json_checksum
 from .chunk_files import begin_read
-from .level_reader import LevelReader, keep_channels, open_arrays, pool_of
+from .level_reader import LevelReader, open_arrays, pool_of
 from .ngff import find_image, read_json
 from .store_layout import BORDER, CELL, DTYPES, CoarseChannel, StoreLayout, value_dtype
 from .tensorstores import Deadline, begin_open, child, kvstore
@@ -75,16 +75,17 @@ class Store:
         context, root, deadline = str(location), kvstore(location), Deadline(_OPEN_TIMEOUT)
         check.text(context, "image", image)
         parent = root
-        root, pyramid, own_layout = find_image(context, root, image, deadline)
+        root, pyramid = find_image(context, root, image, deadline)
+        own_layout = pyramid.layout
         # A channel of a store of several: its folder is a store, too.
         if own_layout and root != parent:
             context = root if isinstance(root, str) else root["path"].rstrip("/")
-        arrays, channel_index, sizes = open_arrays(context, root, pyramid, time, channels, deadline)
+        arrays, channel_index, times = open_arrays(context, root, pyramid, time, channels, deadline)
         dtype = value_dtype(arrays[0].array.dtype.numpy_dtype)
         if dtype not in DTYPES:
             raise ValueError(f"{context}: dtype {dtype} is unknown; known: {', '.join(DTYPES)}")
         x, y, z, width = (arrays[0].size(axis) for axis in "xyzc")
-        self.time, self.times = time, sizes.get("t", 1)
+        self.time, self.times = time, times
         self.layout = layout = own_layout or StoreLayout(extent=(x, y, z), dtype=dtype, width=width)
         differs = (layout.extent, layout.dtype) != ((x, y, z), dtype)
         if differs or (own_layout and own_layout.times != self.times):
@@ -93,7 +94,6 @@ class Store:
         self.label_values = None if label_values is None else torch.from_numpy(label_values)
         self.pool = pool_of(pyramid.info, label_values)
         self._levels = LevelReader(arrays, layout, self.pool)
-        keep_channels(pyramid, sizes, channel_index)
         self.location, self.root = context, kvstore(context)
         self.has_blocks = own_layout is not None
         self.name, self.info, self.dropped = pyramid.name, pyramid.info, tuple(pyramid.dropped)
@@ -111,9 +111,8 @@ class Store:
         self.coarse: dict[str, CoarseChannel] = {}
         self._blocks: BlockReader | None = None
         if own_layout:
-            self._blocks = BlockReader(
-                *(context, self.root, layout, time, self._levels, channel_index, deadline)
-            )
+            place = context, self.root, layout, time
+            self._blocks = BlockReader(*place, self._levels, channel_index, deadline)
             folder = child(self.root, self.coarse_folder)
             if (metadata := read_json(context, folder, "zarr.json", deadline)) is not None:
                 self.coarse = CoarseChannel.parse(context, metadata.get("attributes"))

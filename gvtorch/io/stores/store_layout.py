@@ -137,43 +137,34 @@ class StoreLayout:
             shard=[*channel_axis, *[self.shard] * 3],
             chunk=[1] * len(channel_axis) + [_PYRAMID_CHUNK] * 3,
             dimension_names=self.axes,
-            times=self.times,
         )
 
     def blocks(self, level: int) -> dict[str, Any]:
         """Spec of the array of bordered blocks of a level."""
         path, item_shape = f"gvtorch/blocks/{level}", [self.bordered_side] * 3 + [self.width]
-        return self._grid_array(
-            path, level, self.block, self.shard, item_shape, write_zeros=False, times=self.times
-        )
+        return self._grid_array(path, level, self.block, self.shard, item_shape, write_zeros=False)
 
     def cells(self, level: int) -> dict[str, Any]:
         """Spec of the array of low, high, mean of a level."""
-        return self._grid_array(
-            *(f"gvtorch/cells/{level}", level, CELL, self.shard, [3, self.width], _CELL_CHUNK),
-            times=self.times,
-        )
+        path, item_shape = f"gvtorch/cells/{level}", [3, self.width]
+        return self._grid_array(path, level, CELL, self.shard, item_shape, _CELL_CHUNK)
 
     def coarse_folder(self, time: int) -> str:
         """Returns the folder of a time point's coarse channels."""
         return "gvtorch/coarse" if self.times == 1 else f"gvtorch/coarse/{time}"
 
     def coarse(self, level: int, folder: str, width: int) -> dict[str, Any]:
-        """Spec of the array of bordered blocks of a coarse channel at a level from 1 on; `folder`
-        is the channel's.
-        """
-        item_shape = [self.bordered_side] * 3 + [width]
-        return dataclasses.replace(self, dtype="float16")._grid_array(
-            f"{folder}/{level}", level, self.block, _COARSE_SHARD, item_shape
-        )
+        """Spec of the bordered blocks of a coarse channel in its folder, at a level from 1 on."""
+        path, item_shape = f"{folder}/{level}", [self.bordered_side] * 3 + [width]
+        layout = dataclasses.replace(self, dtype="float16", times=1)
+        return layout._grid_array(path, level, self.block, _COARSE_SHARD, item_shape)
 
     def labels(self) -> dict[str, Any]:
         """Spec of the table of indexed labels."""
         count = self.label_count or 0
         shard = -(-count // _LABEL_CHUNK) * _LABEL_CHUNK
-        return dataclasses.replace(self, dtype="int64")._array(
-            "gvtorch/labels", shape=[count], shard=[shard], chunk=[_LABEL_CHUNK]
-        )
+        layout = dataclasses.replace(self, dtype="int64", times=1)
+        return layout._array("gvtorch/labels", shape=[count], shard=[shard], chunk=[_LABEL_CHUNK])
 
     def bounds(self, level: int) -> list[dict[str, Any]]:
         """Specs of the temporary arrays of the smallest and largest finest value in each voxel.
@@ -191,7 +182,8 @@ class StoreLayout:
         shard_side: int,
         item_shape: list[int],
         chunk_items: int = 1,
-        **options: Any,
+        *,
+        write_zeros: bool = True,
     ) -> dict[str, Any]:
         """Spec of an array of items of `item_shape`, one for each cube of `side` voxels of a level;
         `chunk_items` are the items along a side of a chunk.
@@ -201,7 +193,7 @@ class StoreLayout:
             shape=[*self.grid(level, side), *item_shape],
             shard=[shard_side // side] * 3 + item_shape,
             chunk=[chunk_items] * 3 + item_shape,
-            **options,
+            write_zeros=write_zeros,
         )
 
     def _array(
@@ -213,28 +205,20 @@ class StoreLayout:
         chunk: list[int],
         dimension_names: str = "",
         write_zeros: bool = True,
-        times: int = 1,
     ) -> dict[str, Any]:
-        if times > 1:  # each time point has shards of its own
-            shape, shard, chunk = [times, *shape], [1, *shard], [1, *chunk]
+        if self.times > 1:  # each time point has shards of its own
+            shape, shard, chunk = [self.times, *shape], [1, *shard], [1, *chunk]
         item_bytes = {**DTYPES, "int64": 8}[self.dtype]
         has_byte_order = item_bytes > 1
         little_endian = {"name": "bytes", "configuration": {"endian": "little"}}
         crc = {"name": "crc32c"}
-        blosc = {
-            "cname": "lz4",
-            "clevel": 5,
-            "shuffle": "shuffle" if has_byte_order else "noshuffle",
-            "typesize": item_bytes,
-            "blocksize": 0,
-        }
+        shuffle = "shuffle" if has_byte_order else "noshuffle"
+        blosc = {"cname": "lz4", "clevel": 5, "shuffle": shuffle, "blocksize": 0}
+        blosc["typesize"] = item_bytes
+        bytes_codec = little_endian if has_byte_order else {"name": "bytes"}
         sharding = {
             "chunk_shape": chunk,
-            "codecs": [
-                little_endian if has_byte_order else {"name": "bytes"},
-                {"name": "blosc", "configuration": blosc},
-                crc,
-            ],
+            "codecs": [bytes_codec, {"name": "blosc", "configuration": blosc}, crc],
             "index_codecs": [little_endian, crc],
         }
         metadata: dict[str, Any] = {
@@ -302,11 +286,9 @@ class StoreLayout:
             and all(_is_list(pair, 2) for pair in ranges)
             and all(is_number(low) and is_number(high) and low <= high for low, high in ranges),
         }
-        for key, is_valid in checks.items():
-            if not is_valid:
-                raise ValueError(
-                    f"{location}: damaged: gvtorch.{key} is {brief(attributes.get(key))}"
-                )
+        if invalid := [key for key, is_valid in checks.items() if not is_valid]:
+            value = brief(attributes.get(invalid[0]))
+            raise ValueError(f"{location}: damaged: gvtorch.{invalid[0]} is {value}")
         copied = ("dtype", "block", "value_range", "times", "label_count", "files_sum", "threshold")
         fields = {key: given[key] for key in copied}
         return cls(extent=tuple(given["extent"]), width=given["channels"], **fields)
@@ -338,10 +320,10 @@ class CoarseChannel:
             raise ValueError(f"{location}: damaged: gvtorch/coarse names no channels")
         parsed = {}
         for name, entry in channels.items():
-            is_complete = isinstance(entry, dict) and isinstance(entry.get("made_of"), dict)
             if not (
-                is_complete
-                and is_name(name)
+                is_name(name)
+                and isinstance(entry, dict)
+                and isinstance(entry.get("made_of"), dict)
                 and entry.get("version") == VERSION
                 and _is_whole(entry.get("width"), 1, 2**12)
                 and _is_whole(entry.get("generation"), 0, 2**31)
@@ -349,9 +331,7 @@ class CoarseChannel:
                 raise ValueError(
                     f"{location}: damaged: gvtorch/coarse has {brief(entry)} for {brief(name)}"
                 )
-            parsed[name] = cls(
-                **{field.name: entry[field.name] for field in dataclasses.fields(cls)}
-            )
+            parsed[name] = cls(**{key: entry[key] for key in ("width", "made_of", "generation")})
         return parsed
 
 

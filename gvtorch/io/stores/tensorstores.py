@@ -154,9 +154,8 @@ def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     (unless it exists).
     """
     omitted = {"read": ("path", "metadata", WRITE_ZEROS), "write": ("path", "metadata")}
-    array_spec = {
-        key: value for key, value in spec.items() if key not in omitted.get(mode, ("path",))
-    }
+    unused = omitted.get(mode, ("path",))
+    array_spec = {key: value for key, value in spec.items() if key not in unused}
     return opened_at(child(root, spec["path"]), array_spec, create=mode == "create")
 
 

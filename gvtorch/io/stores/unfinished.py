@@ -78,7 +78,6 @@ class UnfinishedStore:
 
 
 def is_finished(target: Path) -> bool:
-    """Returns whether there is a finished store."""
     return (target / "zarr.json").exists()
 
 
@@ -99,11 +98,11 @@ def is_begun(target: Path, *, resume: bool, manifest: str = MANIFEST) -> bool:
         raise FileExistsError(f"{target}: there is a store already; remove it or choose a new name")
     folder = target / WORK
     if is_half_written(target, manifest):
-        if not resume:
-            raise FileExistsError(
-                f"{target}: half-written; continue with --resume (resume=True), or remove it"
-            )
-        return True
+        if resume:
+            return True
+        raise FileExistsError(
+            f"{target}: half-written; continue with --resume (resume=True), or remove it"
+        )
     empty = target.is_dir() and {entry.name for entry in target.iterdir()} <= {WORK}
     if empty and not any(folder.glob("*.json")):
         return False
@@ -169,9 +168,7 @@ def claimed_folder(target: Path) -> Iterator[None]:
 
 @contextmanager
 def locked(file: Path, message: str) -> Iterator[IO[str]]:
-    """Opens a file that one process at a time may hold open; raises OSError(message) if one
-    does.
-    """
+    """Opens a file that one process at a time may hold open; raises OSError if one does."""
     import fcntl
 
     with file.open("a") as lock:
@@ -198,12 +195,6 @@ def _check_settings(target: Path, settings: dict[str, Any]) -> None:
                 f"{target}: was begun with {key} {previous.get(key)!r}, now it is {value!r}; "
                 "remove the store to begin again"
             )
-
-
-def count_done(target: Path) -> int:
-    """Returns the number of finished tasks in a target's journal."""
-    journal = target / WORK / JOURNAL
-    return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
 
 def _write_journal_lines(journal: IO[str], done: Mapping[Task, TaskResult]) -> None:
@@ -270,9 +261,8 @@ def fingerprint(source: str | Path, target: Path | None = None) -> list[Any]:
     digest, file_count = hashlib.sha256(), 0
     skipped = None if target is None else os.path.realpath(target)
     for folder, folders, names in os.walk(path):
-        folders[:] = sorted(
-            name for name in folders if os.path.realpath(os.path.join(folder, name)) != skipped
-        )
+        paths = {name: os.path.realpath(os.path.join(folder, name)) for name in sorted(folders)}
+        folders[:] = [name for name, inner in paths.items() if inner != skipped]
         for file in sorted(os.path.join(folder, name) for name in names):
             stat = os.stat(file, follow_symlinks=os.path.exists(file))
             line = f"{os.path.relpath(file, path)} {stat.st_size} {stat.st_mtime_ns}\n"
