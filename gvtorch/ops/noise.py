@@ -62,13 +62,11 @@ def noise(
         check.integer(context, "period", cells, low=0, high=2**28)
         for cells in (*period, 0, 0, 0)[:3]
     )
-    kind_index, arguments = (
-        KINDS.index(kind),
-        twin.NoiseArguments(twin.salts(seed), (x, y, z), jitter, reach),
-    )
+    kind_index, salts = KINDS.index(kind), twin.salts(seed)
     if runs_twin(backend, point_pn):
+        arguments = twin.NoiseArguments(salts, (x, y, z), jitter, reach)
         return twin.noise(point_pn, kind_index, arguments)
-    scalars = (*(salt & 0xFFFFFFFF for salt in arguments.salt), x, y, z, jitter, reach)
+    scalars = (*(salt & 0xFFFFFFFF for salt in salts), x, y, z, jitter, reach)
     return torch.ops.gvtorch.noise(point_pn.contiguous(), kind_index, *scalars)
 
 

@@ -91,9 +91,7 @@ class ChannelLook:
         opacity = _DEFAULT_OPACITY if self.opacity is None else self.opacity
         opacity = check.number(context, "opacity", opacity, low=0, high=1)
         fractions = [piece / _RAMP_PIECES for piece in range(_RAMP_PIECES)]
-        rising = [
-            (low + fraction * (high - low), opacity * fraction * fraction) for fraction in fractions
-        ]
+        rising = [(low + share * (high - low), opacity * share * share) for share in fractions]
         return TransferFunction([*rising, (high, opacity)], [(low, 0, 0, 0), (high, *color)])
 
 
@@ -172,9 +170,7 @@ class Channels(Shader):
         Raises:
             ValueError: There are more than 16, or the image lacks one of `components`.
         """
-        if not isinstance(image, Volume | Store):
-            kind = type(image).__name__
-            raise ValueError(f"Channels.of: image must be a Volume or a Store, got {kind}")
+        check.instance("Channels.of", "image", image, Volume, Store)
         width = image.width
         chosen = range(width) if components is None else components
         chosen = check.items("Channels.of", "components", chosen)
@@ -212,10 +208,8 @@ class Channels(Shader):
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the header and the rows of all channels, see csrc/shaders/channels.h."""
         functions = self._visible_functions()
-        function_keys = [
-            (c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in functions
-        ]
-        key = (self.mode, *function_keys, sampling)
+        keys = [(c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in functions]
+        key = (self.mode, *keys, sampling)
         if key not in self._tables:
             self._tables = {key: _make_table(functions, self.mode == "additive", sampling)}
         return self._tables[key]
@@ -266,9 +260,8 @@ def _make_table(
         with np.errstate(divide="ignore"):
             (length,) = sampling.lengths(function.reference, 1)
             halvings = np.log1p(-rows[:, 3]) * (-length / math.log(2))
-        table[:, row_slice, 3] = (
-            np.minimum(halvings, _OPAQUE_HALVINGS) * 2.0 ** np.arange(levels)[:, None]
-        )
+        halvings = np.minimum(halvings, _OPAQUE_HALVINGS)
+        table[:, row_slice, 3] = halvings * 2.0 ** np.arange(levels)[:, None]
         opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0)
         used_rows += len(rows)
     dtype, device = sampling.dtype, sampling.device

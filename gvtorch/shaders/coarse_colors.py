@@ -15,8 +15,9 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from ..base import boxes
 from ..base.stage import Progress
-from ..base.volume import DIRECTIONS, Volume, movable
+from ..base.volume import DIRECTIONS, Volume, to_numpy
 from ..ops.shading import COLOR_WIDTH, FAINT, LIT_COLOR_WIDTH
 from .shader import ColorTable, row_and_fraction
 
@@ -41,19 +42,15 @@ class VolumeField:
     slab_side = 256
 
     def __init__(self, volume: Volume, component: int) -> None:
-        self._values = volume.data[..., component].cpu()
+        self._values = to_numpy(volume.data[..., component])
         z, y, x = self._values.shape
         self.shape = (z, y, x)
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
         """See `FinestVoxels`."""
-        box = movable(self._values)
-        for axis, (first, end, size) in enumerate(zip(low, high, self.shape, strict=True)):
-            if first >= 0 and end <= size:
-                box = box.narrow(axis, first, end - first)
-            else:
-                box = box.index_select(axis, torch.arange(first, end).clamp(0, size - 1))
-        return box.view(self._values.dtype)
+        start, stop = boxes.clamped_box(low, high, self.shape)
+        part = self._values[boxes.index(start, stop)]
+        return torch.from_numpy(boxes.repeat_edges(part, start, low, high))
 
 
 def write_colors(
@@ -324,9 +321,8 @@ def _weigh_moments(
     else:
         source_index = torch.where(lit, index, len(alpha) - 1).flip(0).cummin(0).values.flip(0)
     source_alpha = alpha.gather(0, source_index)
-    weight = light * torch.where(
-        source_alpha > 0, alpha / torch.where(source_alpha > 0, source_alpha, 1.0), 0.0
-    )
+    ratio = alpha / torch.where(source_alpha > 0, source_alpha, 1.0)
+    weight = light * torch.where(source_alpha > 0, ratio, 0.0)
     weight = torch.where(lit, weight, weight / FAINT)
     torch.gather(color[3:], 1, source_index.expand_as(out), out=out)
     out *= weight

@@ -33,10 +33,7 @@ def linear_color(
     three numbers in [0, 1], which are linear; raises ValueError if it is neither.
     """
     if not isinstance(value, str):
-        color = check.triple(context, "colour", value)
-        for component in color:
-            check.number(context, "colour", component, low=0, high=1)
-        return color
+        return check.triple(context, "colour", value, low=0, high=1)
     text = named.get(value.lower(), value)
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         names = ", ".join(named)

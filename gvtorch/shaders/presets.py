@@ -143,9 +143,8 @@ def convert_colors(name: str, colors: np.ndarray, **options: bool) -> np.ndarray
     import kornia.color
 
     planes = torch.from_numpy(np.array(colors, np.float64)).reshape(-1, 3).T[None, :, :, None]
-    return (
-        getattr(kornia.color, name)(planes, **options)[0, :, :, 0].T.reshape(colors.shape).numpy()
-    )
+    converted = getattr(kornia.color, name)(planes, **options)
+    return converted[0, :, :, 0].T.reshape(colors.shape).numpy()
 
 
 def linear_from_srgb(colors: np.ndarray) -> np.ndarray:

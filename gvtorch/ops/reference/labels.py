@@ -109,17 +109,12 @@ class Labels(Lit):
         hidden = ~(self.contribution(piece, probe, fine)[:, 3] > 0)
         holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
         label = self.row_of(self.channel.nearest(holder, piece.middle).value)
-        clear_after, clear, hit_clear = (
-            self.sum.clear * (1 - alpha[:, 0]),
-            self.sum.clear,
-            self.sum.hit_clear,
-        )
+        clear, hit_clear = self.sum.clear, self.sum.hit_clear
+        clear_after = clear * (1 - alpha[:, 0])
         hit = mask & (clear_after < hit_clear) & (clear >= hit_clear)
         self.features = torch.where(hit[:, None], (1 + label)[:, None].to(alpha), self.features)
         shown = mask & (alpha[:, 0] > 0)
-        self.normal = torch.where(
-            shown[:, None], self.normal + clear[:, None] * normal, self.normal
-        )
+        self.add_normal(clear[:, None] * normal, shown)
         self.sum.add_light(clear[:, None] * color, shown)
         self.sum.absorb(alpha[:, 0], piece, shown)
 
@@ -138,9 +133,8 @@ class Labels(Lit):
         alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
         normal = torch.zeros_like(color)
         if self.light.parameters.own_as(LabelNumbers).lit > 0:
-            vector = self.channel.toward_others(holder, nearest) * (
-                holder.scale[:, None] / self.light.cube
-            )
+            voxels = self.channel.toward_others(holder, nearest)
+            vector = voxels * (holder.scale[:, None] / self.light.cube)
             normal = unit(torch.where((holder.brick >= 0)[:, None], vector, 0.0))
             faces_away = dot(normal, self.light.direction) > 0
             normal = torch.where(faces_away[:, None], -normal, normal)

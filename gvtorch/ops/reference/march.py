@@ -282,12 +282,8 @@ class Walk:
 
             # A node of one value, or of none, is crossed in one step; else one interval is added.
             one_step = active & (visit.uniform | visit.invisible)
-            level, base, count, start = (
-                intervals.level,
-                intervals.base,
-                intervals.count,
-                intervals.start,
-            )
+            level, base = intervals.level, intervals.base
+            count, start = intervals.count, intervals.start
             middle, odd, length = intervals.middle, visit.uniform | intervals.cut, intervals.length
             moving = active
             while moving.any():
@@ -318,8 +314,8 @@ class Walk:
             return visitor.hides(ray_index, *self.channel.value_range(node, t.dtype))
 
         descent = tree.descend(finest, wanted, hides)
-        voxel_fits = voxel <= cone
-        blends = voxel_fits & (wanted > 0)
+        fits = voxel <= cone
+        blends = fits & (wanted > 0)
         only_fine = ~blends | (descent.coarse < 0)
         fine = tree.holder(descent.fine, descent.fine_depth, finest, beam)
         coarse_node = torch.where(only_fine, descent.fine, descent.coarse)
@@ -334,13 +330,10 @@ class Walk:
         same = visitor.same(fine.node.clamp(min=0), coarse.node.clamp(min=0))
         uniform = ~invisible & (fine.brick < 0) & (coarse.brick < 0) & same
         exit_t = beam.leave(*tree.levels.corners(finest, descent.depth))
-        visit = Visit(
-            fine, coarse, voxel, voxel_above, t, wanted, voxel_fits, exit_t, invisible, uniform
-        )
+        visit = Visit(fine, coarse, voxel, voxel_above, t, wanted, fits, exit_t, invisible, uniform)
         self.visit = self.visit.index_put((ray_index,), visit)
-        self.visits = self.visits.index_add(
-            0, ray_index, torch.ones_like(ray_index, dtype=torch.int32)
-        )
+        one = torch.ones_like(ray_index, dtype=torch.int32)
+        self.visits = self.visits.index_add(0, ray_index, one)
         self.missed = self.missed.index_put((ray_index,), self.missed[ray_index] | missed)
 
 

@@ -57,9 +57,8 @@ def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tens
     angle_change = ratio + (math.pi / 2 - 1) * (ratio * ratio * ratio)
     _, sine = _complex_power(up / safe_radius, axis_distance / safe_radius, n)
     sine_bound = larger(sine, -sine) + n * angle_change
-    least_sine = _at_least(
-        _at_least(axis_distance - reach, 0.0) / _at_least(outer_radius, 1e-30), 1 / n
-    )
+    least_ratio = _at_least(axis_distance - reach, 0.0) / _at_least(outer_radius, 1e-30)
+    least_sine = _at_least(least_ratio, 1 / n)
     around = clamp(smaller(sine_bound, torch.ones_like(sine_bound)) / least_sine, 1.0, n)
     low, high = n * _product(inner_radius, n - 1), n * _product(outer_radius, n - 1)
     return high * around, low, high
@@ -119,11 +118,8 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor
     z, reach, bailout = center_k3.mT, reach_k, orbit.bailout_1
     constant, added_reach, added_separation = z, reach, 1.0
     if orbit.constant_3 is not None:
-        constant, added_reach, added_separation = (
-            orbit.constant_3[:, None],
-            torch.zeros_like(reach),
-            0.0,
-        )
+        constant, added_reach = orbit.constant_3[:, None], torch.zeros_like(reach)
+        added_separation = 0.0
     low_separation = high_separation = torch.ones_like(reach)
     low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
     inside = torch.ones_like(reach, dtype=torch.bool)  # some point may not have escaped yet

@@ -27,10 +27,8 @@ class Rows:
 
     def index_put(self, index: tuple[Tensor], rows: Self) -> Self:
         """Returns a copy with the rows of some rays replaced."""
-        own_fields = vars(self).items()
-        return replace(
-            self, **{name: row.index_put(index, vars(rows)[name]) for name, row in own_fields}
-        )
+        changed = vars(rows)
+        return replace(self, **{n: f.index_put(index, changed[n]) for n, f in vars(self).items()})
 
 
 class SceneBox(NamedTuple):

@@ -79,12 +79,8 @@ class Isosurface(Lit):
     def __post_init__(self) -> None:
         super().__post_init__()
         zeros = torch.zeros_like(self.sum.clear)
-        numbers = self.light.parameters.own_as(IsosurfaceNumbers)
-        self.numbers, self.level, self.filled = (
-            numbers,
-            torch.as_tensor(numbers.level),
-            numbers.filled,
-        )
+        self.numbers = self.light.parameters.own_as(IsosurfaceNumbers)
+        self.level, self.filled = torch.as_tensor(self.numbers.level), self.numbers.filled
         self.is_hit = torch.zeros_like(zeros, dtype=torch.bool)
         self.last_value, self.last_end, self.share = zeros, zeros - INF, zeros
 
@@ -286,10 +282,8 @@ def shade_rays(
     shadows = Shadows(walk, light.cube, arguments.cone_scale)
     other = channel.other(shading.other_bzyxc, shading.other_tnc, shading.other_component)
     features = beam.first.new_zeros((len(beam.first), shading.features))
-    shader = twin.begin(
-        *(rays, arguments, walk, light, other, features),
-        shadows if is_shadowed else None,
-    )
+    fields = (light, other, features, shadows if is_shadowed else None)
+    shader = twin.begin(rays, arguments, walk, *fields)
     walk.follow(shader)
     shader.done(walk)
     return (

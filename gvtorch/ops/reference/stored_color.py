@@ -5,6 +5,7 @@ csrc/shaders/stored_color.h and, lit, in shaders.h.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -90,9 +91,7 @@ class Filtered(Lit):
         self.add_by_function(piece, probe, mask & ~has_colors)
         if not (mask & has_colors).any():
             return
-        contribution = probe.blend(
-            piece.middle, lambda holder: self.contribution(piece, probe, holder)
-        )
+        contribution = probe.blend(piece.middle, partial(self.contribution, piece, probe))
         self.add_contribution(contribution, piece, mask & has_colors)
 
     def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
@@ -152,9 +151,8 @@ class FilteredLit(Filtered):
         self.lit(self.rgba(piece, probe), piece, probe, mask)
 
     def add_contribution(self, contribution: Tensor, piece: Piece, mask: Tensor) -> None:
-        clear, shown = self.sum.clear[:, None], mask & (contribution[:, 3] > 0)
-        normal = self.normal + clear * contribution[:, 4:]
-        self.normal = torch.where(shown[:, None], normal, self.normal)
+        shown = mask & (contribution[:, 3] > 0)
+        self.add_normal(self.sum.clear[:, None] * contribution[:, 4:], shown)
         super().add_contribution(contribution, piece, mask)
 
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
@@ -191,9 +189,8 @@ class FilteredLit(Filtered):
             column = [m[i] for i in ((0, 1, 2), (1, 3, 4), (2, 4, 5))[axis]]
             weight, total, axial = d * d, m[0] + m[3] + m[5], column[axis]
             valid = (total > 0) & (axial > 0)
-            scale = (
-                sqrt_exact(torch.where(valid, total, 0.0) / torch.where(valid, axial, 1.0)) * weight
-            )
+            ratio = torch.where(valid, total, 0.0) / torch.where(valid, axial, 1.0)
+            scale = sqrt_exact(ratio) * weight
             signed_scale = torch.where(against, scale, -scale)[:, None]
             mean = mean + weight[:, None] * torch.stack(m, 1)
             front = front + signed_scale * torch.stack(column, 1)
