@@ -282,10 +282,8 @@ class Lighted:
         for direction in _hemisphere_directions(points.normal, rays.sample, lighting.cones):
             # Cones stay above the surface.
             growth = dot(direction, points.normal).clamp(0, _MAX_CONE_GROWTH)
-            near_cones, far_cones = (
-                self._cones_from(lifted, direction, growth, *span)
-                for span in ((start, middle), (middle, end))
-            )
+            near_cones = self._cones_from(lifted, direction, growth, start, middle)
+            far_cones = self._cones_from(lifted, direction, growth, middle, end)
             front = trace(near_cones)
             hits = points.tally(over(front, trace(behind(far_cones, front)), dimmed=True))
             absorbed = (front.alpha + hits.alpha).to(unblocked) / 2
