@@ -142,6 +142,7 @@ class Filtered(Shader):
         Raises:
             ValueError: Tree and volume do not belong together, or an argument is out of its range.
         """
+        check.instance("Filtered", "tree", tree, N3Tree)
         check.instance("Filtered", "volume", volume, Volume)
         check.integer("Filtered", "component", component, low=0, high=volume.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
@@ -160,8 +161,7 @@ class Filtered(Shader):
         shape = (count, side, side, side, color_channel.width)
         colors = torch.zeros(shape, dtype=color_channel.dtype)
         level_arguments = (tree.branching, tree.depth, tree.device, color_channel.width)
-        levels = shader.levels(volume, *level_arguments, progress)
-        for level, values in enumerate(levels, 1):
+        for level, values in enumerate(shader.levels(volume, *level_arguments, progress), 1):
             level_rows = (locs[:count, 3] == tree.depth - level).nonzero()[:, 0]
             for rows in level_rows.split(_BATCH_BRICKS):
                 zyx = locs[rows, :3].flip(1)
@@ -352,11 +352,9 @@ class Filtered(Shader):
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
-            raise ValueError(
-                f"{context}: the colours {self.other!r} were made of another function or "
-                "component, or it was edited: make them again (Filtered.of, Filtered.add_to, a new "
-                "producer)"
-            )
+            made = f"the colours {self.other!r} were made of another function or component"
+            hint = "make them again (Filtered.of, Filtered.add_to, a new producer)"
+            raise ValueError(f"{context}: {made}, or it was edited: {hint}")
         widths = channel_widths(self.numbers)
         check_width(f"{context}: filtered colours need", tree, self.other, *widths)
         arguments = super().shading(context, tree)
