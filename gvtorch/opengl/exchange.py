@@ -82,7 +82,7 @@ class Exchange:
                 the context (such as `glfw.get_proc_address`); default: the system's library.
 
         Raises:
-            ValueError: A size is not one of a texture, or there is no such device.
+            ValueError: A size is below 1 or too large for a texture, or there is no such device.
             RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
                 can't map its buffers.
         """

@@ -90,8 +90,7 @@ def orbit_bounds(
     """Bounds the distances that `orbits` returns over balls of centres (k, 3) and radii (k,).
 
     Returns:
-        (2, k): lower and upper bounds of the distances of all points of a ball; (-1, inf) where
-        nothing is known.
+        (2, k): lower and upper bounds of all distances in a ball; (-1, inf) if nothing is known.
 
     Raises:
         ValueError: See `orbits`.

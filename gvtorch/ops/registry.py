@@ -178,7 +178,7 @@ def _register_fake(op: Any, fake: Callable[..., Any]) -> None:
 
 def _refuse_gradients(op: Any) -> None:
     """Makes an op without a backward raise where an input requires a gradient: its outputs would
-    require one too, and yield None. Autograd calls this in every mode: eager, script, compile and
+    require one too, and yield None. Autograd calls this in every mode: eager, script, compile,
     export.
     """
     names = argument_names(op)

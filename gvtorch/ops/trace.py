@@ -31,8 +31,7 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
     """Checks rays."""
     names = "origin_r3 direction_r3 cone_r2 range_r2"
     names += "" if rays.clear_r is None else " clear_r"
-    fields = _fields(rays, torch.float64, names)
-    sizes = check.tensors(context, rays.origin_r3.device, fields)
+    sizes = check.tensors(context, rays.origin_r3.device, _fields(rays, torch.float64, names))
     check.integer(context, "width", rays.width, low=0)
     if rays.width and sizes["r"] % rays.width:
         raise ValueError(f"{context}: {sizes['r']} rays are not whole rows of {rays.width} pixels")

@@ -69,11 +69,7 @@ _OPAQUE_LENGTH = 1e-20  # a reference length so short that any opacity above 0 b
 
 
 class Lit(LitShader):
-    """The transfer function with Blinn-Phong lighting on both sides of a surface.
-
-    Attributes:
-        in_the_way: Shader whose alpha blocks the cones of `Lighting`; None: the transfer function.
-    """
+    """The transfer function with Blinn-Phong lighting on both sides of a surface."""
 
     kind = "Lit"
     shadowed_kind = "ShadowedLit"
@@ -114,9 +110,7 @@ class Lit(LitShader):
 
 
 class PreIntegrated(Shader):
-    """The transfer function, integrated over the values between two samples, so that thin peaks of
-    the function need no finer steps.
-    """
+    """The transfer function, integrated between two samples: thin peaks need no finer steps."""
 
     kind = "PreIntegrated"
     transfer: TransferFunction
@@ -269,10 +263,8 @@ class Isosurface(LitShader):
 
     def _check_color(self) -> None:
         if (self.color is None or isinstance(self.color, TransferFunction)) == (self.other is None):
-            kind = class_name(self)
-            raise ValueError(
-                f"{kind}: a transfer function or color=None and color_channel belong together"
-            )
+            parts = "a transfer function or color=None and color_channel"
+            raise ValueError(f"{class_name(self)}: {parts} belong together")
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         self._check_color()
@@ -321,9 +313,7 @@ class Isosurface(LitShader):
 
 
 class DistanceField(Isosurface):
-    """The surface of a signed distance field: where the distance is `offset`, by default 0. The
-    inside is where it is smaller.
-    """
+    """The surface of a signed distance field, where it is `offset`; inside, it is smaller."""
 
     distance = True
     offset = also_called("value")

@@ -52,8 +52,7 @@ class ChannelLook:
         window: (low, high) in data units: values at which it begins to show, and is brightest.
         component: Index of the number of a voxel; None: the channel's index in the list.
         visible: Whether it is shown.
-        opacity: At the window's upper end, over an interval as long as the smallest spacing; 0.5 if
-            left out.
+        opacity: At the window's upper end, over a length of the smallest spacing; 0.5 if left out.
         name: Name for display.
     """
 
@@ -81,10 +80,8 @@ class ChannelLook:
                     raise ValueError(f"{context}: it has a transfer function, so no {name}")
             return check.instance(context, "transfer", self.transfer, TransferFunction)
         if self.window is None:
-            raise ValueError(
-                f"{context}: window=(low, high) or a transfer function is missing; "
-                "Channels.of(volume) finds windows"
-            )
+            missing = "window=(low, high) or a transfer function is missing"
+            raise ValueError(f"{context}: {missing}; Channels.of(volume) finds windows")
         low, high = window_of(context, self.window)
         default = DEFAULT_COLORS[index] if count > 1 else "white"
         color = channel_color(context, default if self.color is None else self.color)
@@ -115,10 +112,6 @@ class Channels(Shader):
 
     The numbers are those of one channel of the pool, in any order. Coarse levels hold means, as for
     other shaders; there is no `Filtered` variant.
-
-    Attributes:
-        looks: The looks, in order; the list itself may also be edited.
-        mode: "additive" or "opacity".
     """
 
     kind = "ChannelMix"
@@ -133,7 +126,7 @@ class Channels(Shader):
         """Sets the looks; a transfer function is short for a look with only that.
 
         Args:
-            looks: 1 to 16 of them.
+            looks: 1 to 16 of them, in order; the attribute is a list that may be edited, too.
             mode: How they are combined.
             channel: Name of the pool's channel; None: that of the options.
 

@@ -178,10 +178,8 @@ def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
         )
     low, high = value_range or (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
     if high - low >= _MAX_TABLE_ROWS:
-        raise ValueError(
-            f"Labels: channel {channel!r} reaches from {low:g} to {high:g}, a table holds "
-            f"{_MAX_TABLE_ROWS} labels"
-        )
+        reach = f"reaches from {low:g} to {high:g}, a table holds {_MAX_TABLE_ROWS} labels"
+        raise ValueError(f"Labels: channel {channel!r} {reach}")
     return float(low), np.arange(int(low), int(high) + 1)
 
 
@@ -217,7 +215,7 @@ class _Appearance:
         )
 
     def colors_of(self, labels: np.ndarray) -> np.ndarray:
-        """Returns colours (m, 3) of labels (m,), which must be sorted."""
+        """Returns colours (m, 3) of sorted labels (m,)."""
         colors = distinct_colors(labels)
         listed = (labels >= 0) & (labels < len(self.listed_colors))
         colors[listed] = self.listed_colors[labels[listed]]
@@ -225,9 +223,7 @@ class _Appearance:
         return colors
 
     def opacities(self, labels: np.ndarray) -> np.ndarray:
-        """Returns opacities (m,) per reference length of labels (m,), which must be sorted; 0 for
-        those that are not visible.
-        """
+        """Returns opacities (m,) per reference length of sorted labels (m,); 0 if not visible."""
         opacities = np.full(len(labels), self.opacity)
         _assign_rows(opacities, labels, self.opacity_by_label)
         if self.visible is not None:

@@ -50,9 +50,7 @@ def a_number(low: float = -math.inf, high: float = math.inf) -> Check:
 
 
 def a_triple(low: float = -math.inf, high: float = math.inf, zero: bool = True) -> Check:
-    """A check for three finite numbers in [low, high], or a tensor of them (see `a_number`); all
-    three may be 0 if `zero` is true.
-    """
+    """A check for three finite numbers in [low, high], as `a_number`; `zero`: they may all be 0."""
 
     def checked(owner: Any, name: str, value: Any) -> Any:
         context = class_name(owner)

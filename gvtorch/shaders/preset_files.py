@@ -55,8 +55,7 @@ def read_preset(path: str | Path, name: str | None) -> tuple[FunctionPoints, flo
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file holds something else, or has no such preset, or several and no name was
-            given.
+        ValueError: It holds something else, has no such preset, or several, and no name was given.
     """
     file = Path(path)
     if not file.is_file():
@@ -68,7 +67,7 @@ def read_preset(path: str | Path, name: str | None) -> tuple[FunctionPoints, flo
         if file.suffix == ".xml":
             nodes = ElementTree.parse(file).iter("VolumeProperty")
             presets = {node.get("name") or node.get("id") or "": node.attrib for node in nodes}
-            return _slicer_points(file, _choose(file, presets, name)), None, False
+            return _slicer_points(file, _choose(presets, name)), None, False
         content = check.json_file("transfer function file", file)
         if isinstance(content, dict) and "volumeProperties" in content:
             _refuse_name(name)
@@ -84,13 +83,12 @@ def read_preset(path: str | Path, name: str | None) -> tuple[FunctionPoints, flo
         maps = {key: item for key, item in presets.items() if "RGBPoints" in item}
         if name in presets.keys() - maps or not maps:  # ParaView's lists may hold both kinds
             raise ValueError("holds colours of categories (IndexedColors), which are no function")
-        return _paraview_points(file, _choose(file, maps, name)), None, True
+        return _paraview_points(file, _choose(maps, name)), None, True
     except OverflowError:
         raise ValueError(f"{file}: holds a number that is too large") from None
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"{file}: not a file of the kind that its ending says: {error!r}"
-        ) from None
+        problem = f"not a file of the kind that its ending says: {error!r}"
+        raise ValueError(f"{file}: {problem}") from None
     except ValueError as error:
         message = one_line(error)
         prefix = "" if message.startswith(str(file)) else f"{file}: "
@@ -102,7 +100,7 @@ def _refuse_name(name: str | None) -> None:
         raise ValueError(f"holds one preset, without a name: leave {name!r} out")
 
 
-def _choose(file: Path, presets: Mapping[str, Any], name: str | None) -> Any:
+def _choose(presets: Mapping[str, Any], name: str | None) -> Any:
     if name is None and len(presets) == 1:
         return next(iter(presets.values()))
     if name in presets:
@@ -242,9 +240,7 @@ def _second_weight(position: np.ndarray, midpoint: float, sharpness: float) -> n
 def _gridded_points(
     opacity: np.ndarray, nodes: np.ndarray, space: str = "RGB", *, wrap: bool = False
 ) -> FunctionPoints:
-    """Returns opacity and linear colour on one grid. `nodes` are (value, sRGB), and may also have a
-    midpoint and a sharpness.
-    """
+    """Returns opacity and linear colour on one grid; nodes: value, sRGB (, midpoint, sharpness)."""
     if not len(nodes) or not len(opacity):
         raise ValueError("holds no points")
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]

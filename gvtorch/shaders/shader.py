@@ -105,8 +105,7 @@ class Shader(Checked):
         other_component: Index of the second channel's number that colours a surface.
         reads_coarse: Whether the second channel may be a coarse one, which only coarse bricks have.
         reads_labels: Whether it reads a channel of labels; other shaders would blend them.
-        whole_ray: Whether it must see each ray in one pass: options that cut rays into pieces
-            refuse it.
+        whole_ray: Whether it must see each ray in one pass: options that cut rays refuse it.
         uses_torch: Whether its colours are computed in torch, outside of the kernel. The host then
             waits for the device, so it can't be recorded as a CUDA graph.
     """
@@ -246,9 +245,7 @@ class Shader(Checked):
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
-        """Which value along a ray it shows. Results of a ray's pieces are joined by this rule;
-        None: they are composited.
-        """
+        """Which value along a ray it shows, of all pieces of a ray; None: they are composited."""
         return None
 
     def cut_surface(self) -> CutSurface | None:
@@ -312,10 +309,8 @@ def interval_levels(root_voxel: float, step: float) -> int:
 def check_shader(context: str, name: str, value: Any) -> None:
     """Raises ValueError unless a user's argument is a shader."""
     if not isinstance(value, Shader):
-        kind = type(value).__name__
-        raise ValueError(
-            f"{context}: {name} must be a TransferFunction or another shader, got {kind}"
-        )
+        wanted, kind = "a TransferFunction or another shader", type(value).__name__
+        raise ValueError(f"{context}: {name} must be {wanted}, got {kind}")
 
 
 def check_width(

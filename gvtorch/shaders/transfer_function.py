@@ -198,9 +198,7 @@ class TransferFunction(Shader):
         return not self.opacity[:, 1].any()
 
     def corners(self) -> tuple[float, float, np.ndarray]:
-        """Returns the first and last value of a table, and (k,) positions of the corner points
-        between them, 0 to 1.
-        """
+        """Returns a table's first and last value, and (k,) positions of corners between, 0 to 1."""
         values = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
         low, high = float(values[0]), float(values[-1])
         if high == low:
@@ -343,6 +341,10 @@ def _common_cells(
 
 def _checked_points(context: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
+
+    def refusal(wanted: str) -> ValueError:
+        return ValueError(f"{context}: {name} {wanted}, got {check.quoted(points)}")
+
     try:
         rows = [list(point) for point in points]
         for number in (number for row in rows for number in row):
@@ -351,24 +353,16 @@ def _checked_points(context: str, name: str, points: Points, width: int) -> np.n
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{context}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
-        raise ValueError(
-            f"{context}: {name} must be a list of points {names}, got {check.quoted(points)}"
-        )
+        raise refusal(f"must be a list of points {names}")
     points = array.tolist()
     if not (np.abs(array) <= LARGEST).all():
-        raise ValueError(
-            f"{context}: {name} must be finite and at most {LARGEST:g}, got {check.quoted(points)}"
-        )
+        raise refusal(f"must be finite and at most {LARGEST:g}")
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0))
-        raise ValueError(
-            f"{context}: {name} values must increase, "
-            f"got {array[index, 0]:g} before {array[index + 1, 0]:g} "
-            "(for a jump use two values close to each other)"
-        )
+        got = f"{array[index, 0]:g} before {array[index + 1, 0]:g}"
+        hint = "for a jump use two values close to each other"
+        raise ValueError(f"{context}: {name} values must increase, got {got} ({hint})")
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():
-        raise ValueError(
-            f"{context}: {name} numbers must lie in [0, 1], got {check.quoted(points)}"
-        )
+        raise refusal("numbers must lie in [0, 1]")
     return array

@@ -90,7 +90,8 @@ def _trace_media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
         if not bool(several.any()):
             continue
         shares = [part / _PARTS_PER_STRETCH for part in range(_PARTS_PER_STRETCH)]
-        for part in pairwise((*(near + (far - near) * share for share in shares), far)):
+        part_ends = [near + (far - near) * share for share in shares]
+        for part in pairwise([*part_ends, far]):
             hits = _add_stretch(hits, rays, several, part, stop, partial(_trace_mixed, trees))
     return hits if hits.normal is None else replace(hits, normal=_unit_vectors(hits.normal))
 

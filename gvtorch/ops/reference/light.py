@@ -234,10 +234,8 @@ class Shadows:
         length_l = self.walk.intervals.length_l
         intervals = Intervals(beam, length_l[0], len(length_l))
         intervals.next(torch.ones_like(mask[ray_index]))
-        limits = light.faintest(shader.stop_clear), light.scatters
-        visitor = ShadowVisitor(
-            shader.transfer, shader.channel, shader, direction, torch.ones_like(t), *limits
-        )
+        clear, limits = torch.ones_like(t), (light.faintest(shader.stop_clear), light.scatters)
+        visitor = ShadowVisitor(shader.transfer, shader.channel, shader, direction, clear, *limits)
         walk = Walk(intervals, self.walk.tree, shader.channel)
         walk.follow(visitor)
         self.samples[ray_index] += walk.samples

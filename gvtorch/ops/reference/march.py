@@ -63,9 +63,8 @@ class Visit(NodePair):
         """Returns (r,) bool: the interval's middle is in the node and wants the same levels."""
         middle = intervals.middle
         cone = intervals.beam.cone(middle)
-        fits = torch.where(
-            self.voxel_fits, (cone >= self.voxel) & (cone < self.voxel_above), cone < self.voxel
-        )
+        between = (cone >= self.voxel) & (cone < self.voxel_above)
+        fits = torch.where(self.voxel_fits, between, cone < self.voxel)
         return intervals.inside() & (middle < self.exit) & fits
 
 
@@ -101,8 +100,7 @@ class Probe:
 
     def blend(self, t: Tensor, read: Callable[[Holder], Tensor]) -> Tensor:
         """Returns (r,) or (r, c): `read` of the fine node, blended with `read` of the coarse one,
-        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is as wide as
-        `voxel_above`.
+        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is `voxel_above`.
         """
         nodes = self.nodes
         mixed, value = nodes.fine.node != nodes.coarse.node, read(nodes.fine)
@@ -302,9 +300,7 @@ class Walk:
             active = intervals.inside() & visitor.goes_on(leaving)
 
     def find(self, ray_index: Tensor, t: Tensor, visitor: Visitor) -> None:
-        """Finds the nodes of the rays `ray_index` (k,) at t (r,); stamps what is used and requests
-        what is absent.
-        """
+        """Finds nodes of rays `ray_index` (k,) at t (r,); stamps the used, requests the absent."""
         tree, beam, t = self.tree, self.intervals.beam[ray_index], t[ray_index]
         cone, finest = beam.cone(t), tree.levels.finest_cells(beam.at(t))
         wanted = tree.levels.wanted(cone)

@@ -112,8 +112,8 @@ def orbits(point_p3: Tensor, orbit: TwinOrbit) -> Tensor:
 
 
 def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor:
-    """Iterates the centres of balls, and for each a radius within which the orbits of all points of
-    the ball are; see `ops.orbit_bounds`.
+    """Iterates centres of balls, and radii that hold the orbits of all their points; see
+    `ops.orbit_bounds`.
     """
     z, reach, bailout = center_k3.mT, reach_k, orbit.bailout_1
     constant, added_reach, added_separation = z, reach, 1.0
@@ -140,12 +140,10 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor
         stepped, _ = orbit.step(z)
         z = torch.where(inside, stepped + constant, z)
         reach = torch.where(inside, stretch * reach + added_reach, reach)
-        low_separation = torch.where(
-            inside, low_factor * low_separation + added_separation, low_separation
-        )
-        high_separation = torch.where(
-            inside, high_factor * high_separation + added_separation, high_separation
-        )
+        low_next = low_factor * low_separation + added_separation
+        high_next = high_factor * high_separation + added_separation
+        low_separation = torch.where(inside, low_next, low_separation)
+        high_separation = torch.where(inside, high_next, high_separation)
     deep = torch.full_like(low, -INSIDE)
     low = torch.where(inside, smaller(low, deep), low)
     high = torch.where(inside, larger(high, deep), high)
@@ -154,9 +152,8 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor
 
 def _estimate(radius: Tensor, separation: Tensor, orbit: TwinOrbit) -> Tensor:
     """Returns distance estimates of orbits at `radius`; `separation`: their neighbours' stretch."""
-    return (
-        0.5 * radius * log_exact(radius) / separation if orbit.logarithmic else radius / separation
-    )
+    length = 0.5 * radius * log_exact(radius) if orbit.logarithmic else radius
+    return length / separation
 
 
 def _squared(z: Tensor) -> Tensor:

@@ -69,14 +69,8 @@ class Beam(Rows):
         high_real, deep = high.to(real), is_deep(args)
         last_real = (high_real * torch.tensor(0.9999999).to(high_real)).double()
         scene = SceneBox(high, high * (1 - 2.0**-50) if deep else last_real, deep)
-        columns = (
-            direction,
-            near_cone + growth * moved,
-            growth,
-            rays.range_r2[:, 0] - moved,
-            rays.range_r2[:, 1] - moved,
-            moved,
-        )
+        first, last = (rays.range_r2 - moved[:, None]).unbind(1)
+        columns = (direction, near_cone + growth * moved, growth, first, last, moved)
         real_direction, *numbers = (column.to(real) for column in columns)
         start = rounded(origin + moved[:, None] * direction, deep, real)
         beam = cls(scene, *start, real_direction, *numbers).clipped()

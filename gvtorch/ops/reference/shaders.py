@@ -274,11 +274,9 @@ def shade_rays(
     walk = Walk.enter(rays, arguments, twin.bricks)
     beam, channel = walk.intervals.beam, walk.channel
     columns = (rays.origin_r3, rays.direction_r3, beam.moved, arguments.place_33[1])
-    light = Light(
-        ShadeParameters.read(parameter_54),
-        channel.other(shading.normal_bzyxc, shading.normal_tnc, 0),
-        *(column.to(beam.first) for column in columns),
-    )
+    normals = channel.other(shading.normal_bzyxc, shading.normal_tnc, 0)
+    rounded = (column.to(beam.first) for column in columns)
+    light = Light(ShadeParameters.read(parameter_54), normals, *rounded)
     shadows = Shadows(walk, light.cube, arguments.cone_scale)
     other = channel.other(shading.other_bzyxc, shading.other_tnc, shading.other_component)
     features = beam.first.new_zeros((len(beam.first), shading.features))
@@ -286,11 +284,8 @@ def shade_rays(
     shader = twin.begin(rays, arguments, walk, *fields)
     walk.follow(shader)
     shader.done(walk)
-    return (
-        *shader.sum.hits(beam),
-        *(walk.samples + shadows.samples, walk.missed | shadows.missed),
-        *(unit(shader.normal), shader.features),
-    )
+    samples, missed = walk.samples + shadows.samples, walk.missed | shadows.missed
+    return *shader.sum.hits(beam), samples, missed, unit(shader.normal), shader.features
 
 
 def _with_length(rows: Tensor, lengths: Tensor) -> Tensor:

@@ -1,5 +1,5 @@
-"""Part of the torch twin: shaders that read colours of voxels, stored or filtered, as in
-csrc/shaders/stored_color.h and, lit, in shaders.h.
+"""Part of the torch twin: stored and filtered colours, as in csrc/shaders, stored_color.h and
+shaders.h.
 """
 
 from __future__ import annotations
@@ -110,17 +110,16 @@ class Filtered(Lit):
 
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 4) premultiplied colours and alphas of intervals, from one of the nodes."""
-        row = self.function_row(piece, probe, holder)
+        row = self.function_row(piece, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
         color, alpha, scale = self.seen_colors(self.stored_numbers(piece, holder), piece, holder)
         colors = torch.cat((color[:, :3] * scale[:, None], alpha[:, None]), 1)
         colors = torch.where((scale > 0)[:, None], colors, 0.0)
         return torch.where(self.has_colors(holder)[:, None], colors, row)
 
-    def function_row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+    def function_row(self, piece: Piece, holder: Holder) -> Tensor:
         """Returns (r, 4) the transfer function's rows for one node's values."""
-        value = self.channel.sample(holder, piece.middle)
-        return self.transfer.interval(value, piece)
+        return self.transfer.interval(self.channel.sample(holder, piece.middle), piece)
 
     def stored_numbers(self, piece: Piece, holder: Holder) -> Tensor:
         """Returns (r, c) all numbers of a node's filtered colours; 0 where it has none."""
@@ -158,7 +157,7 @@ class FilteredLit(Filtered):
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 7): the result of `Filtered.contribution`, lit, and normals times alpha."""
         t, light = piece.middle, self.light
-        row = self.function_row(piece, probe, holder)
+        row = self.function_row(piece, holder)
         normal = light.to_eye(probe.slope(holder, t, light.cube))
         color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
         by_function = torch.cat((color * alpha, alpha, normal * alpha), 1)

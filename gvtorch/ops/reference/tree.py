@@ -105,14 +105,10 @@ class Tree:
         self.brick_n = torch.where(brick < len(args.bricks_bzyxc), brick, ABSENT).view(-1)
         self.request_n, self.per_tile = args.request_tn.view(-1), args.child_tn.shape[1]
 
-    def descend(
-        self, finest: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
-    ) -> Descent:
-        """Descends from the root to the wanted depth, or as far as tiles exist and something is
-        seen; stamps the tiles.
-        """
+    def descend(self, finest: Tensor, wanted: Tensor, hides: Callable[[Tensor], Tensor]) -> Descent:
+        """Descends to the wanted depth, or as far as tiles exist and are seen; stamps the tiles."""
         args, n = self.arguments, self.levels.branching
-        node, depth = torch.full_like(wanted_r, args.root), torch.zeros_like(wanted_r)
+        node, depth = torch.full_like(wanted, args.root), torch.zeros_like(wanted)
         absent = torch.full_like(node, -1)
         descent = Descent(node, depth, absent, hides(node), absent, depth, absent, depth)
         active = torch.ones_like(node, dtype=torch.bool)
@@ -121,12 +117,12 @@ class Tree:
             has_data = active & (self.brick_n[descent.node] != ABSENT)
             descent.fine = torch.where(has_data, descent.node, descent.fine)
             descent.fine_depth = torch.where(has_data, descent.depth, descent.fine_depth)
-            above_wanted = has_data & (descent.depth < wanted_r)
+            above_wanted = has_data & (descent.depth < wanted)
             descent.coarse = torch.where(above_wanted, descent.node, descent.coarse)
             descent.coarse_depth = torch.where(above_wanted, descent.depth, descent.coarse_depth)
 
             tile = self.child_n[descent.node].to(torch.int64)
-            active = active & (descent.depth < wanted_r) & (tile >= 0) & ~descent.hidden
+            active = active & (descent.depth < wanted) & (tile >= 0) & ~descent.hidden
             if not active.any():
                 return descent
             x, y, z = (self.levels.cells(finest, descent.depth + active) % n).unbind(1)
@@ -165,9 +161,8 @@ class Tree:
         args.stamp_b[brick[brick >= 0]] = args.frame_1[0]
 
     def request(self, mask: Tensor, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
-        """Joins requests, where `mask` (r,) is true, into the request words: kinds by OR,
-        priorities by maximum. A priority is the width of one voxel on the screen, in 1/16 pixel, up
-        to 128 pixels.
+        """Joins requests, where `mask` (r,) is true, into words: kinds by OR, priorities by
+        maximum. A priority is a voxel's width on the screen in 1/16 pixel, up to 128 pixels.
         """
         if not mask.any():
             return
