@@ -385,7 +385,7 @@ def looks_of(**options) -> list[gv.ChannelLook]:
             lambda: gv.Channels(looks_of(transfer=FUNCTIONS[0][2], name="GFP")),
             "channel 0 (GFP): it has a transfer function, so no window",
         ),
-        (lambda: gv.Channels.of(3), "image must be a Volume or a Store, got int"),
+        (lambda: gv.Channels.of(3), "image must be a Volume or Store, got int"),
         (lambda: gv.Channels.of(gv.Volume(np.zeros((2, 2, 2, 20)))), "components=[0, 1, ...]"),
         (
             lambda: gv.Channels.of(gv.Volume(np.zeros((2, 2, 2))), components=[1]),

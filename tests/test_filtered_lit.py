@@ -187,7 +187,7 @@ def test_unlit_it_shows_the_filtered_colours_and_lighting_lights_them():
 def test_mistakes_are_told(tmp_path):
     volume = matter()
     tree = gv.N3Tree.from_volume(volume, 4)
-    with pytest.raises(ValueError, match="must be a TransferFunction or a Lit, got Isosurface"):
+    with pytest.raises(ValueError, match="must be a TransferFunction or Lit, got Isosurface"):
         gv.Filtered(gv.Isosurface(0.5))
     for base in (
         gv.Lit(SHADER, normals="normal"),

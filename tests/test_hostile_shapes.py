@@ -19,6 +19,7 @@ TALL = ((-1, -1, -1), (1, 1, 3))
 POINTS = [[0.0, 0, 0], [1, 1, 2]]
 PLACES, WHOLE = torch.rand(4, 3), torch.zeros(4, 3, dtype=torch.int64)
 VOLUME = gv.Volume(torch.rand(8, 8, 8, 2))
+PICTURE, GRAY = torch.ones(2, 4, 3), gv.TransferFunction.preset("gray", 0, 1)
 BYTES = np.full((4, 4, 4), 255, np.uint8)
 
 
@@ -101,6 +102,13 @@ def test_integers_of_numpy_are_extents():
         (lambda: gv.MeshProducer(triangle(), band=1e300), "voxelize: band must be finite and >= 2"),
         (lambda: gv.SampledDistance.of_mesh(triangle(), resolution=2**20), "GiB"),
         (lambda: gv.PointProducer(POINTS, box=3), "sort_points: box must be two corners, got 3"),
+        (lambda: gv.CameraPath(5, 5), "CameraPath: eye must be a list, got 5"),
+        (lambda: gv.CameraPath([(0, 0, 1)], [(0, 0, 0)], fov=30), "fov must be a list, got 30"),
+        (lambda: gv.write_cameras("a.json", 5), "cameras must be a Camera or Mapping, got int"),
+        (lambda: gv.Environment(PICTURE, rotation="up"), "rotation must be numbers, got 'up'"),
+        (lambda: gv.Environment(PICTURE, rotation=torch.eye(3) * 1j), "must be real numbers, got"),
+        (lambda: gv.Overlay("wide", 64), "Overlay: width must be an int >= 1, got 'wide'"),
+        (lambda: gv.Filtered.of("tree", VOLUME, GRAY), "Filtered: tree must be a N3Tree, got str"),
         (lambda: gv.Channels(3), "Channels: looks must be a list, got 3"),
         (lambda: gv.Channels.of(VOLUME, components=5), "components must be a list, got 5"),
         (lambda: gv.ModuleShader(print, channels=5), "channels must be names, got 5"),

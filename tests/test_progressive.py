@@ -302,7 +302,7 @@ def test_what_breaks_off_leaves_no_file(blobs, tmp_path):
             "must end in .png, .tif or .npy, got",
         ),
         (lambda t, c: gv.render_tiles(print, c, t / "b" / "a.tif"), "folder not found"),
-        (lambda t, c: gv.render_tiles(print, c, t / "a.tif", bits=9), "8 or 16 or 32 bits, got 9"),
+        (lambda t, c: gv.render_tiles(print, c, t / "a.tif", bits=9), "8, 16 or 32 bits, got 9"),
         (lambda t, c: gv.render_tiles(print, c, t / "a.tif", memory="x"), "memory must be bytes"),
         (lambda t, c: gv.render_tiles(print, None, t / "a.tif"), "camera must be a Camera"),
         (

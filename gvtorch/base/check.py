@@ -136,9 +136,15 @@ def shape_of(name: str) -> str:
 def instance(context: str, name: str, value: Any, *kinds: type[Kind]) -> Kind:
     """Returns `value`; raises ValueError unless it is an instance of one of the classes."""
     if not isinstance(value, kinds):
-        wanted = " or ".join(kind.__name__ for kind in kinds)
+        wanted = either(kind.__name__ for kind in kinds)
         raise ValueError(f"{context}: {name} must be a {wanted}, got {type(value).__name__}")
     return value
+
+
+def either(words: Iterable[str]) -> str:
+    """Returns "a, b or c" for words a, b and c."""
+    *others, last = words
+    return f"{', '.join(others)} or {last}" if others else last
 
 
 def items(context: str, name: str, value: Any) -> tuple[Any, ...]:
@@ -163,8 +169,7 @@ def one_of(context: str, name: str, value: Any, allowed: Iterable[Any]) -> None:
     """Raises ValueError, which lists the known values, unless `value` is one of them."""
     choices = [*allowed]
     if getattr(value, "ndim", 0) or value not in choices:  # arrays have no truth value
-        *others, last = map(repr, choices or [None])
-        listing = f"{', '.join(others)} or {last}" if others else last
+        listing = either(map(repr, choices or [None]))
         raise ValueError(f"{context}: {name} must be {listing}, got {quoted(value)}")
 
 
@@ -337,9 +342,17 @@ def branching_two(context: str, branching: Any, feature: str) -> None:
 
 
 def triple(
-    context: str, name: str, value: Any, *, positive: bool = False
+    context: str,
+    name: str,
+    value: Any,
+    *,
+    positive: bool = False,
+    low: float = -math.inf,
+    high: float = math.inf,
 ) -> tuple[float, float, float]:
-    """Returns (x, y, z); raises ValueError unless they are finite, and positive if `positive`."""
+    """Returns (x, y, z); raises ValueError unless they are finite, in [low, high], and positive if
+    `positive`.
+    """
     no_gradient(context, name, value)
     if isinstance(value, Tensor):
         value = value.tolist()
@@ -351,7 +364,7 @@ def triple(
         raise ValueError(
             f"{context}: {name} must be three numbers, got {len(items)}: {quoted(value)}"
         )
-    x, y, z = (number(context, name, item) for item in items)
+    x, y, z = (number(context, name, item, low=low, high=high) for item in items)
     if positive and min(x, y, z) <= 0:
         raise ValueError(f"{context}: {name} must be positive, got {(x, y, z)}")
     if positive and not _MIN_SIZE <= min(x, y, z) <= max(x, y, z) <= 1 / _MIN_SIZE:

@@ -46,9 +46,9 @@ def class_name(owner: Any) -> str:
     return type(owner).__name__
 
 
-def instance_of(kind: type) -> Check:
-    """Returns a check that a value is an instance of a class."""
-    return lambda owner, name, value: check.instance(class_name(owner), name, value, kind)
+def instance_of(*kinds: type) -> Check:
+    """Returns a check that a value is an instance of one of the classes."""
+    return lambda owner, name, value: check.instance(class_name(owner), name, value, *kinds)
 
 
 def optional(checker: Check) -> Check:

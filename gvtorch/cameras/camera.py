@@ -55,8 +55,7 @@ class CameraForm(NamedTuple):
 
 
 class Camera:
-    """Cameras that share width, height and camera model. Threads may share them while none changes
-    them.
+    """Cameras that share width, height and model. Threads may share them while none changes them.
 
     Attributes:
         viewmats: (n, 4, 4) float64, world (or box) to camera.
@@ -64,8 +63,7 @@ class Camera:
             (pinhole), a radian (fisheye, panorama), or a world unit or side of the box (ortho).
         radial_coeffs: (n, 4) float64 distortion of a fisheye.
         max_angle: (n,) float64 radians; a fisheye's rays beyond it have an empty range.
-        window: First row of this camera, which may cover a strip only, and number of rows of the
-            whole picture.
+        window: First row of this camera, which may be a strip, and rows of the whole picture.
         sample: Number of this sample among those of its pixels; see `Rays.sample`.
         batched: False for one camera whose pictures have no batch dimension.
         fitted: Half width and height of the whole picture at distance 1 if `placed` is to find the
@@ -159,20 +157,17 @@ class Camera:
             fov, width, height, model: See `look_at`.
             up: +x, -x, +y, -y, +z, -z, or (3,) world.
             fit: Finds the distance from which the whole box just fits into the picture, when the
-                camera is `placed`. A fisheye or a panorama comes no nearer than where the box spans
-                90 degrees.
+                camera is `placed`. For a fisheye or panorama the box spans at most 90 degrees.
 
         Raises:
-            ValueError: A number is not finite or out of its range, or `fit` and a distance are
-                both given.
+            ValueError: A number is out of its range, or both `fit` and a distance are given.
         """
         context = "Camera.orbit"
         if fit and distance is not None:
             raise ValueError(f"{context}: fit finds the distance: leave it out, got {distance!r}")
         distance = (1.0 if fit else 2.4) if distance is None else distance
-        az, el, distances = batches(
-            context, azimuth=(azimuth, ()), elevation=(elevation, ()), distance=(distance, ())
-        )
+        numbers = {"azimuth": azimuth, "elevation": elevation, "distance": distance}
+        az, el, distances = batches(context, **{n: (value, ()) for n, value in numbers.items()})
         if bool((distances <= 0).any()):
             raise ValueError(f"{context}: distance must be > 0, got {distance!r}")
         axis = None if isinstance(up, str) and up == "+y" else upward(context, up)
@@ -298,10 +293,8 @@ class Camera:
 
     def __repr__(self) -> str:
         count = f"{len(self)} x " if self.batched else ""
-        return (
-            f"{type(self).__name__}({count}{self.width}x{self.height}, {self.model}, "
-            f"in {self.frame.value} units)"
-        )
+        size, frame = f"{count}{self.width}x{self.height}", self.frame.value
+        return f"{type(self).__name__}({size}, {self.model}, in {frame} units)"
 
     def __getitem__(self, index: int) -> Camera:
         """Returns one camera of the batch."""
@@ -364,9 +357,8 @@ class Camera:
         """
         context, model = "Camera.pixel_width", MODELS[self.model]
         if not model.planar or len(self) != 1 or self.frame is not Coordinates.WORLD:
-            raise ValueError(
-                f"{context}: takes one pinhole or ortho camera in the world, got {self}"
-            )
+            wanted = "one pinhole or ortho camera in the world"
+            raise ValueError(f"{context}: takes {wanted}, got {self}")
         distance = check.number(context, "distance", distance, low=0, open_low=True)
         return (1.0 if model.parallel else distance) / float(self.Ks[0, 0, 0])
 
@@ -384,16 +376,13 @@ class Camera:
         return self.shifted(0, first)._copy_with(height=end - first, window=window)
 
     def numbers(self, device: torch.device | str = "cpu") -> Tensor:
-        """Returns what `pixel_rays` reads, (n, 26) float64, see `CameraColumns`; does not wait for
-        the device.
+        """Returns what `pixel_rays` reads, (n, 26) float64, see `CameraColumns`; does not block.
 
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
         """
         if self.frame is not Coordinates.WORLD:
-            raise ValueError(
-                "Camera.rays: an orbit camera has no position yet, call placed(tree.box)"
-            )
+            raise ValueError("Camera.rays: an orbit camera has no position: call placed(tree.box)")
         view, intrinsics = self.viewmats.numpy(), self.Ks.numpy()
         rotation, translation = view[:, :3, :3], view[:, :3, 3]
         focal, centre = intrinsics[:, (0, 1), (0, 1)], intrinsics[:, :2, 2] - 0.5
@@ -459,8 +448,7 @@ class Camera:
         Raises:
             ValueError: The camera is relative to a box: call `placed(box)` first.
         """
-        all_rows = (0, len(self) * self.height)
-        return self.pixel_rays(self.numbers(device), rows or all_rows)
+        return self.pixel_rays(self.numbers(device), rows or (0, len(self) * self.height))
 
 
 _BATCHED_FIELDS = ("viewmats", "Ks", "radial_coeffs", "max_angle")  # one row per camera

@@ -50,14 +50,11 @@ class CustomCamera(Camera):
         expected_rows: int | str = "r"
         for name, size in (("origin", 3), ("direction", 3), ("cone", 2), ("range", 2)):
             column: Any = getattr(rays, name, None)
-            is_valid = (
-                isinstance(column, Tensor) and column.is_floating_point() and column.dim() == 2
-            )
-            if not is_valid or column.shape[1] != size or expected_rows not in ("r", len(column)):
-                raise ValueError(
-                    f"CustomCamera: rays.{name} must be ({expected_rows}, {size}) float, "
-                    f"got {describe(column)}"
-                )
+            is_valid = isinstance(column, Tensor) and column.is_floating_point()
+            is_valid = is_valid and column.dim() == 2 and column.shape[1] == size
+            if not is_valid or expected_rows not in ("r", len(column)):
+                wanted, got = f"({expected_rows}, {size}) float", describe(column)
+                raise ValueError(f"CustomCamera: rays.{name} must be {wanted}, got {got}")
             columns.append(column)
             expected_rows = len(column)
         if rays.transmittance is not None:
@@ -69,22 +66,15 @@ class CustomCamera(Camera):
         self.height = integer("CustomCamera", "height", rows if height is None else height, low=1)
         self.window = (0, self.height)
         if count % (self.width * self.height):
-            raise ValueError(
-                f"CustomCamera: {count} rays do not make pictures of "
-                f"{self.width}x{self.height} pixels"
-            )
+            pixels = f"{self.width}x{self.height} pixels"
+            raise ValueError(f"CustomCamera: {count} rays do not make pictures of {pixels}")
         columns.append(torch.zeros_like(columns[0][:, :1]))
         self._rays = torch.cat([column.to(torch.float64) for column in columns], 1)
         if rays.direction.device.type == "cpu":
-            has_nan = self._rays.isnan().any(1)
-            if bool(has_nan.any()):
-                raise ValueError(f"CustomCamera: rays must not be NaN, {int(has_nan.sum())} are")
-            off_unit = (rays.direction.norm(dim=1) - 1).abs() > 1e-3
-            if bool(off_unit.any()):
-                raise ValueError(
-                    "CustomCamera: directions must be of unit length, "
-                    f"{int(off_unit.sum())} are not"
-                )
+            if bad := int(self._rays.isnan().any(1).sum()):
+                raise ValueError(f"CustomCamera: rays must not be NaN, {bad} are")
+            if bad := int(((rays.direction.norm(dim=1) - 1).abs() > 1e-3).sum()):
+                raise ValueError(f"CustomCamera: directions must be of unit length, {bad} are not")
         self.frame, self.batched = Coordinates.WORLD, count > self.width * self.height
 
     @classmethod
@@ -106,14 +96,11 @@ class CustomCamera(Camera):
             range: (..., 2) first and last distance; 0 and infinity by default.
 
         Raises:
-            ValueError: A shape is wrong, or (checked on the CPU only) a number is NaN, or a
-                direction 0.
+            ValueError: A shape is wrong, or (checked on the CPU only) a number NaN, a direction 0.
         """
         if direction.dim() not in (3, 4) or direction.shape[-1] != 3 or not direction.numel():
-            raise ValueError(
-                "CustomCamera: direction must be (h, w, 3) or (n, h, w, 3), "
-                f"got {describe(direction)}"
-            )
+            wanted = "(h, w, 3) or (n, h, w, 3)"
+            raise ValueError(f"CustomCamera: direction must be {wanted}, got {describe(direction)}")
         direction = normalize(direction.to(torch.float64), dim=-1, eps=1e-300)
         if range is None:
             range = torch.stack((direction.new_zeros(()), direction.new_full((), torch.inf)))
@@ -126,9 +113,8 @@ class CustomCamera(Camera):
             try:
                 shaped[name] = part.to(direction).expand(shape)
             except RuntimeError:
-                raise ValueError(
-                    f"CustomCamera: {name} must broadcast to {shape}, got {describe(part)}"
-                ) from None
+                wanted = f"broadcast to {shape}, got {describe(part)}"
+                raise ValueError(f"CustomCamera: {name} must {wanted}") from None
         flat: dict[str, Any] = {n: part.reshape(-1, part.shape[-1]) for n, part in shaped.items()}
         height, width = direction.shape[-3:-1]
         camera = cls(Rays(**flat), width, height)
@@ -188,10 +174,8 @@ class CustomCamera(Camera):
         """Returns the numbers of the camera `thinned` by `stride`, extrapolated by `frames` frames
         from the `numbers` of the last two frames; see `continued`.
         """
-        now, before = (
-            self._pictures(numbers)[:, ::stride, ::stride].flatten(0, 2)
-            for numbers in (now, before)
-        )
+        pictures = (self._pictures(numbers) for numbers in (now, before))
+        now, before = (rays[:, ::stride, ::stride].flatten(0, 2) for rays in pictures)
         return continued(now, before, frames, RayColumns.LINE, RayColumns.DIRECTION)
 
     def pixel_rays(self, numbers: Tensor, rows: tuple[int, int]) -> Rays:

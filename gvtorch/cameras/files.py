@@ -32,18 +32,9 @@ from .camera import Camera
 from .motion import quaternion_of, rotation_of
 from .poses import Coordinates
 
-_FLIP = torch.diag(
-    torch.tensor([1.0, -1, -1, 1], dtype=torch.float64, device="cpu")
-)  # y down to y up
-_PVCC_PROPERTIES = (
-    ("CameraPosition", 3),
-    ("CameraFocalPoint", 3),
-    ("CameraViewUp", 3),
-    ("CenterOfRotation", 3),
-    ("CameraViewAngle", 1),
-    ("CameraParallelScale", 1),
-    ("CameraParallelProjection", 1),
-)
+_FLIP = torch.tensor([1.0, -1, -1, 1], dtype=torch.float64, device="cpu").diag()  # y down to up
+_PVCC_VECTORS = ("CameraPosition", "CameraFocalPoint", "CameraViewUp", "CenterOfRotation")
+_PVCC_NUMBERS = ("CameraViewAngle", "CameraParallelScale", "CameraParallelProjection")
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 _FISHEYE = "OPENCV_FISHEYE"
 #: Parameters of COLMAP's models; distorted pinholes are read only if all their coefficients are 0.
@@ -82,14 +73,11 @@ def read_cameras(
         raise FileNotFoundError(f"cameras not found: {path}")
     readers = {".pvcc": _read_pvcc, ".json": _read_transforms}
     if path.is_file() and path.suffix not in readers:
-        raise ValueError(
-            f"read_cameras: path must end in .pvcc or .json or be a folder of COLMAP, got {path}"
-        )
+        wanted = "end in .pvcc or .json or be a folder of COLMAP"
+        raise ValueError(f"read_cameras: path must {wanted}, got {path}")
     try:
-        if path.is_dir():
-            cameras = _read_colmap(path)
-        else:
-            cameras = readers[path.suffix](path, width, height)
+        size = (width, height)
+        cameras = _read_colmap(path) if path.is_dir() else readers[path.suffix](path, *size)
         if width is not None and height is not None:
             cameras = {name: _scaled(camera, width, height) for name, camera in cameras.items()}
     except (KeyError, IndexError, TypeError, ArithmeticError, xml.ParseError) as error:
@@ -120,6 +108,7 @@ def write_cameras(
         FileNotFoundError: The folder around it does not exist.
     """
     path, context = Path(path), "write_cameras"
+    check.instance(context, "cameras", cameras, Camera, Mapping)
     if isinstance(cameras, Camera):
         cameras = {f"{n:04d}.png": cameras[n] for n in range(len(cameras))}
     for name, camera in cameras.items():
@@ -165,7 +154,7 @@ def _read_pvcc(path: Path, width: int | None, height: int | None) -> dict[str, C
     for element in root.iter("Property"):
         values = [float(item.attrib["value"]) for item in element.iter("Element")]
         properties[element.attrib["name"]] = values
-    eye, target, up = (properties[name][:3] for name, _ in _PVCC_PROPERTIES[:3])
+    eye, target, up = (properties[name][:3] for name in _PVCC_VECTORS[:3])
     if width is None or height is None:
         raise ValueError("does not give the size of the picture: give width and height")
     if not properties.get("CameraParallelProjection", [0])[0]:
@@ -183,9 +172,7 @@ def _pvcc_text(cameras: Mapping[str, Camera], distance: float) -> str:
     centre = camera.Ks.new_tensor([camera.width / 2, camera.height / 2])
     square = bool(torch.isclose(camera.Ks[0, 0, 0], camera.Ks[0, 1, 1], rtol=1e-9))
     if camera.model not in ("pinhole", "ortho") or not square:
-        raise ValueError(
-            f"write_cameras: .pvcc holds pinhole and ortho, of square pixels: {camera}"
-        )
+        raise ValueError(f"write_cameras: .pvcc holds pinhole or ortho, of square pixels: {camera}")
     if not torch.allclose(camera.Ks[0, :2, 2], centre, atol=1e-6):
         raise ValueError("write_cameras: .pvcc has its axis in the middle of the picture")
     to_world = torch.linalg.inv(camera.viewmats[0])
@@ -197,10 +184,9 @@ def _pvcc_text(cameras: Mapping[str, Camera], distance: float) -> str:
     property_values = (eye, target, up, target, [angle], [scale], [int(is_ortho)])
     root = xml.Element("PVCameraConfiguration", description="ParaView camera", version="1.0")
     proxy = xml.SubElement(root, "Proxy", group="views", type="RenderView", id="1", servers="21")
-    for (name, count), values in zip(_PVCC_PROPERTIES, property_values, strict=True):
-        element = xml.SubElement(
-            proxy, "Property", name=name, id=f"1.{name}", number_of_elements=str(count)
-        )
+    for name, values in zip(_PVCC_VECTORS + _PVCC_NUMBERS, property_values, strict=True):
+        attributes = {"name": name, "id": f"1.{name}", "number_of_elements": str(len(values))}
+        element = xml.SubElement(proxy, "Property", attributes)
         numbers = values.tolist() if isinstance(values, Tensor) else values
         for index, value in enumerate(numbers):
             xml.SubElement(element, "Element", index=str(index), value=repr(value))

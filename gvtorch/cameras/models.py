@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -260,9 +261,8 @@ class Panorama(Model):
         fx, fy = pixels.focal.unbind(1)
         span = torch.maximum(pixels.y.cos() / fx, 1 / fy) * torch.minimum(fx, fy)
         widening = span[:, None].expand_as(latitude)
-        return pixels.rays(
-            pixels.to_world(torch.stack(parts, -1)), widening=widening, inside=inside
-        )
+        direction = pixels.to_world(torch.stack(parts, -1))
+        return pixels.rays(direction, widening=widening, inside=inside)
 
 
 #: Every camera model by its name.
@@ -309,8 +309,6 @@ def undistort(radius: Tensor, k: Tensor, limit: Tensor) -> Tensor:
 
 def last_rising_angle(k: Tensor) -> float:
     """Returns the largest angle, at most pi, up to which `distort` rises; `k`: (4,) on the CPU."""
-    import numpy as np
-
     k1, k2, k3, k4 = k.tolist()
     roots = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
     real = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]

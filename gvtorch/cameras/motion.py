@@ -35,10 +35,8 @@ class Motion:
         """
         self._times, self._poses = list(times), list(poses)
         spans = [b - a for a, b in pairwise(times)]
-        steps = [
-            logarithm(torch.linalg.solve(a, b)) / span
-            for (a, b), span in zip(pairwise(poses), spans, strict=True)
-        ]
+        moves = zip(pairwise(poses), spans, strict=True)
+        steps = [logarithm(torch.linalg.solve(a, b)) / span for (a, b), span in moves]
         pairs = zip(pairwise(steps), pairwise(spans), strict=True)
         speeds = [_key_velocity(*velocities, *durations) for velocities, durations in pairs]
         if closed and len(steps) > 1:
@@ -78,9 +76,7 @@ def _key_velocity(before: Tensor, after: Tensor, span_before: float, span_after:
 
 
 def exponential(step: Tensor) -> Tensor:
-    """Returns the pose (4, 4) that a velocity (7,) reaches from the identity in time 1: growth (1),
-    turning (3), shift (3).
-    """
+    """Returns the pose (4, 4) after time 1 at a velocity (7,): growth, turning (3), shift (3)."""
     scaled, integral = _flow(step)
     pose = torch.eye(4, dtype=step.dtype, device="cpu")
     pose[:3, :3], pose[:3, 3] = scaled, integral @ step[4:]
@@ -103,19 +99,15 @@ def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
     x, y, z = (step[1:4] / angle if angle > 0 else step[1:4]).tolist()
     cross = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     powers = torch.stack((torch.eye(3, dtype=step.dtype, device="cpu"), cross, cross @ cross))
-    scale, rate = math.exp(growth), complex(growth, angle)
-    exp_minus_1 = complex(
-        math.expm1(growth) * math.cos(angle) - 2 * math.sin(angle / 2) ** 2,
-        scale * math.sin(angle),
-    )  # exp(rate) - 1, also where the rate is small
+    scale, rate, sine = math.exp(growth), complex(growth, angle), math.sin(angle)
+    versine = 2 * math.sin(angle / 2) ** 2  # 1 - cosine, also where the angle is small
+    exp_minus_1 = complex(math.expm1(growth) * math.cos(angle) - versine, scale * sine)
     mean = exp_minus_1 / rate if rate else 1 + 0j
     mean_growth = math.expm1(growth) / growth if growth else 1.0
-    rotation_weights = step.new_tensor([1, math.sin(angle), 2 * math.sin(angle / 2) ** 2])
+    rotation_weights = step.new_tensor([1, sine, versine])
     integral_weights = step.new_tensor([mean_growth, mean.imag, mean_growth - mean.real])
-    return (
-        scale * torch.tensordot(rotation_weights, powers, 1),
-        torch.tensordot(integral_weights, powers, 1),
-    )
+    rotation = scale * torch.tensordot(rotation_weights, powers, 1)
+    return rotation, torch.tensordot(integral_weights, powers, 1)
 
 
 def _rotation_vector(rotation: Tensor) -> Tensor:

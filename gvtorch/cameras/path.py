@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,23 +44,20 @@ class CameraPath:
         Raises:
             ValueError: The lists differ in length, or a number is not finite.
         """
+        eye = check.items("CameraPath", "eye", eye)
         count = len(eye)
         if count < 1:
             raise ValueError("CameraPath: at least one key is needed")
         up = [_DEFAULT_UP] * count if up is None else up
         fov = [_DEFAULT_FOV] * count if fov is None else fov
-        lists: dict[str, Sequence[Any]] = {"eye": eye, "target": target, "up": up, "fov": fov}
+        given = {"eye": eye, "target": target, "up": up, "fov": fov}
+        lists = {name: check.items("CameraPath", name, values) for name, values in given.items()}
         for name, values in lists.items():
             if len(values) != count:
-                expected = "numbers" if name == "fov" else "rows as eye has"
-                raise ValueError(
-                    f"CameraPath: {name} must have {count} {expected}, got {len(values)}"
-                )
-        angles = [[check.number("CameraPath", "fov", angle, low=0, high=360)] for angle in fov]
-        rows = [
-            [check.triple("CameraPath", name, value) for value in lists[name]]
-            for name in ("eye", "target", "up")
-        ]
+                unit = "numbers" if name == "fov" else "rows as eye has"
+                raise ValueError(f"CameraPath: {name} must have {count} {unit}, got {len(values)}")
+        angles = [[check.number("CameraPath", "fov", v, low=0, high=360)] for v in lists.pop("fov")]
+        rows = [[check.triple("CameraPath", n, v) for v in values] for n, values in lists.items()]
         parts = [torch.tensor(part, dtype=torch.float64, device="cpu") for part in (*rows, angles)]
         self._keys = torch.cat(parts, 1)  # (k, 10)
 
@@ -96,9 +92,8 @@ class CameraPath:
         azimuths = azimuth + torch.linspace(0, 360, 37, dtype=torch.float32, device="cpu")
         if fit_size is not None:
             if distance is not None:
-                raise ValueError(
-                    f"{context}: fit_size finds the distance: leave it out, got {distance}"
-                )
+                problem = f"fit_size finds the distance: leave it out, got {distance}"
+                raise ValueError(f"{context}: {problem}")
             fitted = Camera.orbit(azimuths, elevation, None, fov, *fit_size, model, up=up, fit=True)
             farthest = (box.mean(0) - _eye_positions(fitted.placed(box))).norm(dim=1).amax()
             distance = float(farthest / (box[1] - box[0]).max())
@@ -140,9 +135,8 @@ class CameraPath:
         }
         full_keys = [{**defaults, **key} for key in keys]
         try:
-            return cls(
-                *([key[name] for key in full_keys] for name in ("eye", "target", "up", "fov"))
-            )
+            names = ("eye", "target", "up", "fov")
+            return cls(*([key[name] for key in full_keys] for name in names))
         except ValueError as error:
             raise ValueError(f"{path}: {one_line(error)}") from None
 

@@ -1,6 +1,5 @@
 """Poses of cameras, (4, 4) float64 from the world to the camera: made from positions, directions
-and angles, checked, and extrapolated from frame to frame. Axes are OpenCV's: x right, y down, z
-forward.
+and angles, checked, and extrapolated. Axes are OpenCV's: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -50,18 +49,15 @@ def batches(context: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]
         batch = numbers.dim() - len(shape)
         if batch not in (0, 1) or numbers.shape[batch:] != shape:
             batch_shape = str(("n", *shape)).replace("'", "")
-            got = tuple(numbers.shape)
-            raise ValueError(
-                f"{context}: {name} must be {shape or 'a number'} or {batch_shape}, got {got}"
-            )
+            wanted, got = f"{shape or 'a number'} or {batch_shape}", tuple(numbers.shape)
+            raise ValueError(f"{context}: {name} must be {wanted}, got {got}")
         parsed.append((numbers, shape))
         sizes.append(numbers.shape[:batch])
     try:
         size = np.broadcast_shapes(*sizes)  # torch's imports sympy: half a second
     except ValueError:
-        raise ValueError(
-            f"{context}: {', '.join(values)} do not match, they have different lengths"
-        ) from None
+        names = ", ".join(values)
+        raise ValueError(f"{context}: {names} do not match: different lengths") from None
     return [numbers.expand((*size, *shape)).contiguous() for numbers, shape in parsed]
 
 
@@ -82,9 +78,7 @@ def check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
 
 
 def upward(context: str, up: Up) -> Tensor:
-    """Returns the up direction, (3,) float64, from a name such as "+z" or three numbers; raises
-    ValueError where it is neither, or zero.
-    """
+    """Returns up, (3,) float64, from a name ("+z") or three numbers; ValueError if neither or 0."""
     if isinstance(up, str):
         if up not in DIRECTIONS:
             names = ", ".join(DIRECTIONS)

@@ -56,8 +56,7 @@ def matrices(
         projection and modelview, both (4, 4) float64, or (n, 4, 4) for a batch.
 
     Raises:
-        ValueError: The camera is of another model, or an orbit camera without a position, or not
-            0 < near < far.
+        ValueError: The camera is no pinhole, or not placed, or not 0 < near < far.
     """
     context = "opengl.matrices"
     if check.instance(context, "camera", camera, Camera).model != "pinhole":
@@ -88,8 +87,7 @@ def camera(projection: Tensor, modelview: Tensor, width: int, height: int) -> Ca
     """Makes the camera whose rays go through the pixels that OpenGL draws with these matrices.
 
     Args:
-        projection: (4, 4) or (n, 4, 4) perspective without skew; its near and far planes do not
-            matter.
+        projection: (4, 4) or (n, 4, 4) perspective without skew, with any near and far planes.
         modelview: (4, 4) or (n, 4, 4) world to eye, without scale.
         width: Pixels of the viewport.
         height: Pixels of the viewport.
@@ -229,17 +227,14 @@ def _projection(context: str, projection: Tensor) -> tuple[Tensor, bool]:
     """Returns a projection, checked, in float64 on the CPU, and whether it is orthographic."""
     matrix = check.reals(context, "projection", projection)
     if matrix.dim() not in (2, 3) or matrix.shape[-2:] != (4, 4):
-        raise ValueError(
-            f"{context}: projection must be (4, 4) or (n, 4, 4), got {tuple(matrix.shape)}"
-        )
+        shape = tuple(matrix.shape)
+        raise ValueError(f"{context}: projection must be (4, 4) or (n, 4, 4), got {shape}")
     p = matrix.view(-1, 4, 4)
     last_row = p[0, 3].tolist()
     orthographic = last_row == [0, 0, 0, 1]
     if not (orthographic or last_row == [0, 0, -1, 0]) or bool((p[:, 3] != p[:1, 3]).any()):
-        raise ValueError(
-            f"{context}: projection must end in the row (0, 0, -1, 0) (perspective) or "
-            f"(0, 0, 0, 1) (orthographic), got {last_row}"
-        )
+        rows = "(0, 0, -1, 0) (perspective) or (0, 0, 0, 1) (orthographic)"
+        raise ValueError(f"{context}: projection must end in the row {rows}, got {last_row}")
     zero_column = 2 if orthographic else 3  # column whose x and y must be 0
     zeros = torch.stack((p[:, 0, 1], p[:, 1, 0], p[:, 2, 0], p[:, 2, 1]), 1)
     zeros = torch.cat((zeros, p[:, :2, zero_column]), 1)

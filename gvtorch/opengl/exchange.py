@@ -40,11 +40,7 @@ void main() {
 """
 _PROGRAM_NUMBERS = itertools.count()
 _READ_TYPES = {gl.UNSIGNED_BYTE: torch.uint8, gl.HALF_FLOAT: torch.float16}
-_PIXEL_TYPES = {
-    torch.uint8: gl.UNSIGNED_BYTE,
-    torch.float16: gl.HALF_FLOAT,
-    torch.float32: gl.FLOAT,
-}
+_PIXEL_TYPES = {dtype: number for number, dtype in _READ_TYPES.items()} | {torch.float32: gl.FLOAT}
 _COLOR_FORMATS = {torch.uint8: gl.RGBA8, torch.float16: gl.RGBA16F, torch.float32: gl.RGBA32F}
 _DEPTH_FORMATS = {16: gl.DEPTH_COMPONENT16, 24: gl.DEPTH_COMPONENT24, 32: gl.DEPTH_COMPONENT32F}
 #: Texture parameters: nearest filters, and 0 as the last mipmap level.
@@ -86,8 +82,7 @@ class Exchange:
                 the context (such as `glfw.get_proc_address`); default: the system's library.
 
         Raises:
-            ValueError: A size is not positive or more than a texture can have, or there is no such
-                device.
+            ValueError: A size is below 1 or too large for a texture, or there is no such device.
             RuntimeError: There is no context, its OpenGL is too old, or `share` is true and CUDA
                 can't map its buffers.
         """
@@ -108,16 +103,14 @@ class Exchange:
         # A tensor: all devices divide alike.
         self._byte_max = torch.full((1,), 255.0, dtype=torch.float32, device=self.device)
         transfer_type = _SharedTransfer if self.shared else _HostTransfer
-        self._transfers = defaultdict[str, _HostTransfer](
-            partial(transfer_type, self._gl, self.device)
-        )
+        new_transfer = partial(transfer_type, self._gl, self.device)
+        self._transfers = defaultdict[str, _HostTransfer](new_transfer)
         self._textures: dict[str, tuple[int, int]] = {}  # name and format
         # No other program has an output of this name: `_require_context` looks it up.
         self._output_name = f"result_{next(_PROGRAM_NUMBERS)}"
         with self._gl.unchanged(drawing=True):
-            self._program = self._gl.program(
-                _VERTEX, _FRAGMENT.replace("result", self._output_name)
-            )
+            fragment = _FRAGMENT.replace("result", self._output_name)
+            self._program = self._gl.program(_VERTEX, fragment)
             self._gl.UseProgram(self._program)
             for name, unit in (("color", 0), ("depth", 1)):
                 location = self._gl.GetUniformLocation(self._program, name.encode())
@@ -200,16 +193,14 @@ class Exchange:
 
         Raises:
             ValueError: A wrong shape or dtype.
-            RuntimeError: OpenGL can't draw into the framebuffer, or it has no depth and one was
-                given.
+            RuntimeError: OpenGL can't draw into the framebuffer, or a given depth finds none there.
         """
         with self._in_context("draw", drawing=True):
             self._upload(color, depth)
             attachment = (gl.DRAW_FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.ATTACHED_KIND)
             if depth is not None and not self._attachment_parameter(*attachment):
-                raise RuntimeError(
-                    f"{self._gl.context}: the framebuffer that is bound for drawing has no depth"
-                )
+                problem = "the framebuffer that is bound for drawing has no depth"
+                raise RuntimeError(f"{self._gl.context}: {problem}")
             self._draw_textures("color", None if depth is None else "depth")
 
     def close(self) -> None:
@@ -271,10 +262,8 @@ class Exchange:
             name = self._gl.make("Textures")
             self._textures[kind] = name, stored_format
             self._gl.BindTexture(gl.TEXTURE_2D, name)
-            layout = (
-                gl.DEPTH_COMPONENT if stored_format in _DEPTH_FORMATS.values() else gl.RED,
-                gl.FLOAT,
-            )
+            is_depth = stored_format in _DEPTH_FORMATS.values()
+            layout = (gl.DEPTH_COMPONENT if is_depth else gl.RED, gl.FLOAT)
             self._gl.TexImage2D(gl.TEXTURE_2D, 0, stored_format, *self._size, 0, *layout, None)
             for parameter, value in _TEXTURE_PARAMETERS.items():
                 self._gl.TexParameteri(gl.TEXTURE_2D, parameter, value)
@@ -284,30 +273,21 @@ class Exchange:
 
     def _upload(self, color: Tensor, depth: Tensor | None) -> tuple[int, int]:
         size = (self.height, self.width)
-        if not (
-            isinstance(color, Tensor)
-            and color.dtype in _COLOR_FORMATS
-            and color.dim() == 3
-            and (*color.shape[:2],) == size
-            and color.shape[2] in (3, 4)
-        ):
-            raise ValueError(
-                f"{self._gl.context}: color must be ({size[0]}, {size[1]}, 3 or 4) uint8, "
-                f"float16 or float32, got {check.describe(color)}"
-            )
+        is_color = isinstance(color, Tensor) and color.dtype in _COLOR_FORMATS
+        if not is_color or color.shape not in ((*size, 3), (*size, 4)):
+            wanted = f"({size[0]}, {size[1]}, 3 or 4) uint8, float16 or float32"
+            got = check.describe(color)
+            raise ValueError(f"{self._gl.context}: color must be {wanted}, got {got}")
         if depth is not None and not (
             isinstance(depth, Tensor) and depth.is_floating_point() and depth.shape == (*size, 1)
         ):
-            raise ValueError(
-                f"{self._gl.context}: depth must be ({size[0]}, {size[1]}, 1) floats, "
-                f"got {check.describe(depth)}"
-            )
+            wanted, got = f"({size[0]}, {size[1]}, 1) floats", check.describe(depth)
+            raise ValueError(f"{self._gl.context}: depth must be {wanted}, got {got}")
         if color.shape[2] == 3:
             opaque = 255 if color.dtype == torch.uint8 else 1
             color = torch.cat((color, torch.full_like(color[..., :1], opaque)), -1)
-        color_texture = self._write_texture(
-            "color", color.detach(), _COLOR_FORMATS[color.dtype], gl.RGBA
-        )
+        stored_format = _COLOR_FORMATS[color.dtype]
+        color_texture = self._write_texture("color", color.detach(), stored_format, gl.RGBA)
         if depth is None:
             return color_texture, 0
         return color_texture, self._write_texture("depth", depth.detach().float(), gl.R32F, gl.RED)
@@ -339,9 +319,8 @@ class Exchange:
 
     def _attachment_parameter(self, target: int, attachment: int, parameter: int) -> int:
         """Returns a parameter of a framebuffer's attachment, or 0 if there is none."""
-        if attachment == gl.DEPTH_ATTACHMENT and not self._gl.integer(
-            gl.FRAMEBUFFER_BINDINGS[target]
-        ):
+        binding = gl.FRAMEBUFFER_BINDINGS[target]
+        if attachment == gl.DEPTH_ATTACHMENT and not self._gl.integer(binding):
             attachment = gl.DEPTH  # its name in a window's framebuffer
         get = "GetFramebufferAttachmentParameteriv"
         return self._gl.parameter(get, target, attachment, parameter)
@@ -362,15 +341,12 @@ class Exchange:
         size = self._gl.attached_size(kind, object_name, level)
         # If the size is unknown, OpenGL itself reports whether the texture can be read.
         if size is not None and size != self._size:
-            raise RuntimeError(
-                f"{prefix} {size[0]}x{size[1]} pixels, the exchange {self.width}x{self.height}"
-            )
+            own = f"{self.width}x{self.height}"
+            raise RuntimeError(f"{prefix} {size[0]}x{size[1]} pixels, the exchange {own}")
 
 
 class _HostTransfer:
-    """Moves pixels between any OpenGL and any device through host memory, and flips their rows,
-    which run upwards in OpenGL.
-    """
+    """Moves pixels through host memory, and flips their rows, which run upwards in OpenGL."""
 
     def __init__(self, functions: gl.Functions, device: torch.device) -> None:
         self._gl, self._device = functions, device
@@ -378,16 +354,14 @@ class _HostTransfer:
     def pull(
         self, read: Callable[[int], None], shape: tuple[int, ...], dtype: torch.dtype
     ) -> Tensor:
-        """Returns an image; `read` has OpenGL write it to a host address, or to an offset in the
-        bound buffer.
-        """
+        """Returns an image; `read` writes it to a host address or an offset in the bound buffer."""
         host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda", device="cpu")
         self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, 0)
         read(host.data_ptr())
         return host.to(self._device).flip(0)
 
     def push(self, image: Tensor, write: Callable[[int], None]) -> None:
-        """Passes an image to OpenGL; `write` has OpenGL read it from such an address or offset."""
+        """Passes an image to OpenGL; `write` reads it from such an address or offset."""
         host = image.flip(0).cpu().contiguous()
         self._gl.BindBuffer(gl.PIXEL_UNPACK_BUFFER, 0)
         write(host.data_ptr())

@@ -70,10 +70,7 @@ _STATE: list[_StateNumber] = [
     *(("PixelStorei", (number,), number, value) for number, value in _PIXEL_STORE.items()),
     ("ClampColor", (CLAMP_READ_COLOR,), CLAMP_READ_COLOR, FIXED_ONLY),
     *(("BindBuffer", (target,), query, 0) for target, query in _BUFFER_BINDINGS.items()),
-    *(
-        ("BindFramebuffer", (target,), query, None)
-        for target, query in FRAMEBUFFER_BINDINGS.items()
-    ),
+    *(("BindFramebuffer", (kind,), query, None) for kind, query in FRAMEBUFFER_BINDINGS.items()),
     ("ActiveTexture", (), ACTIVE_TEXTURE, None),
 ]
 _DRAWING_STATE: list[_StateNumber] = [
@@ -87,12 +84,9 @@ _LEGACY_STATE: list[_StateNumber] = [
 ]
 #: Targets of textures with a width and a height, the constant that queries their binding, and the
 #: target that queries their size: 2D, rectangle, array, cube, 3D, array of cubes.
-_TEXTURE_TARGETS = [
-    (TEXTURE_2D, 0x8069, TEXTURE_2D),
-    (0x84F5, 0x84F6, 0x84F5),
-    (0x8C1A, 0x8C1D, 0x8C1A),
-]
-_TEXTURE_TARGETS += [(0x8513, 0x8514, 0x8515), (0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
+_TEXTURE_TARGETS = [(TEXTURE_2D, 0x8069, TEXTURE_2D), (0x84F5, 0x84F6, 0x84F5)]
+_TEXTURE_TARGETS += [(0x8C1A, 0x8C1D, 0x8C1A), (0x8513, 0x8514, 0x8515)]
+_TEXTURE_TARGETS += [(0x806F, 0x806A, 0x806F), (0x9009, 0x900A, 0x9009)]
 
 _CTYPES: dict[str, Any] = {"i": c_int, "u": c_uint, "f": c_float, "n": c_ssize_t}
 _CTYPES |= {"p": c_void_p, "s": c_char_p, "-": None}
@@ -173,9 +167,8 @@ class Functions:
             if not address:
                 raise RuntimeError(f"{self.context}: this OpenGL lacks gl{name}; 3.2 is needed")
             if not isinstance(address, int):
-                raise ValueError(
-                    f"{self.context}: load must give addresses as int, got {address!r} for gl{name}"
-                )
+                got = f"{address!r} for gl{name}"
+                raise ValueError(f"{self.context}: load must give addresses as int, got {got}")
             prototype: Any = ctypes.CFUNCTYPE(*(_CTYPES[code] for code in type_codes))
             setattr(self, name, prototype(address))
 
@@ -220,16 +213,12 @@ class Functions:
         return value
 
     def attached_size(self, kind: int, name: int, level: int) -> list[int] | None:
-        """Returns width and height of a renderbuffer or of a mipmap level of a texture; None if the
-        texture's target does not have both.
-        """
+        """Returns width and height of a renderbuffer or mipmap level; None where there are none."""
         if kind == RENDERBUFFER:
             previous = self.integer(RENDERBUFFER_BINDING)
             self.BindRenderbuffer(RENDERBUFFER, name)
-            get, parameters = (
-                "GetRenderbufferParameteriv",
-                (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT),
-            )
+            get = "GetRenderbufferParameteriv"
+            parameters = (RENDERBUFFER_WIDTH, RENDERBUFFER_HEIGHT)
             size = [self.parameter(get, RENDERBUFFER, parameter) for parameter in parameters]
             self.BindRenderbuffer(RENDERBUFFER, previous)
             return size
@@ -297,9 +286,8 @@ class Functions:
             restorers.callback(self.forget_errors)
             self._set_state(restorers, _STATE)
             for parameter, neutral in _PIXEL_TRANSFER.items() if self._legacy else ():
-                restorers.callback(
-                    self.PixelTransferf, parameter, *self.read("GetFloatv", c_float, 1, parameter)
-                )
+                old = self.read("GetFloatv", c_float, 1, parameter)
+                restorers.callback(self.PixelTransferf, parameter, *old)
                 self.PixelTransferf(parameter, neutral)
             for unit in (1, 0):
                 self.ActiveTexture(TEXTURE0 + unit)
@@ -363,9 +351,8 @@ def _system_loader(context: str) -> Loader:
             return partial(_address, library)
     if has_library:
         raise RuntimeError(f"{context}: {_NO_CONTEXT}")
-    raise RuntimeError(
-        f"{context}: found no OpenGL library; pass load=..., such as glfw.get_proc_address"
-    )
+    hint = "pass load=..., such as glfw.get_proc_address"
+    raise RuntimeError(f"{context}: found no OpenGL library; {hint}")
 
 
 def _address(library: ctypes.CDLL, function: str) -> int | None:

@@ -30,14 +30,11 @@ class RayArguments(NamedTuple):
     @classmethod
     def of(cls, rays: Rays) -> "RayArguments":
         """Converts rays of any dtype."""
-        return cls(
-            rays.origin.double().contiguous(),
-            rays.direction.double().contiguous(),
-            rays.cone.double().contiguous(),
-            rays.range.double().contiguous(),
-            rays.width,
-            None if rays.transmittance is None else rays.transmittance.double().contiguous(),
-        )
+        columns = (rays.origin, rays.direction, rays.cone, rays.range)
+        origin, direction, cone, ranges = (column.double().contiguous() for column in columns)
+        light = rays.transmittance
+        clear = None if light is None else light.double().contiguous()
+        return cls(origin, direction, cone, ranges, rays.width, clear)
 
     def some(self, index: Tensor) -> "RayArguments":
         """Returns the rays at the indices `index` (k,) int64, without a transmittance."""

@@ -231,9 +231,7 @@ def link_bricks(
 def _check_width(*, child_tn: Tensor, child_jw: Tensor, **_: Any) -> None:
     per_tile, width = child_tn.shape[1], child_jw.shape[1]
     if width > per_tile:
-        raise ValueError(
-            f"link_tiles: child_jw must hold at most {per_tile} words a row, got {width}"
-        )
+        raise ValueError(f"link_tiles: child_jw must hold <= {per_tile} words a row, got {width}")
 
 
 @op(_check_width)

@@ -31,8 +31,7 @@ def noise(
     `auto` runs the twin, which torch can differentiate.
 
     Args:
-        point_pn: (p, n) float32 or float64, in cells. Coordinates beyond 2^29 count as 0; NaN
-            gives NaN.
+        point_pn: (p, n) float32 or float64, in cells; beyond 2^29 they count as 0; NaN gives NaN.
         kind: perlin, value, simplex; F1, F2 or F2-F1 of cellular noise.
         seed: Each seed gives a different noise.
         period: Number of cells after which the noise repeats along x, y, z; 0: never.
@@ -58,17 +57,13 @@ def noise(
     reach = check.integer(context, "reach", reach, low=1, high=2)
     if not isinstance(period, Sequence) or len(period) > 3:
         raise ValueError(f"{context}: period must be numbers of cells, one an axis, got {period!r}")
-    x, y, z = (
-        check.integer(context, "period", cells, low=0, high=2**28)
-        for cells in (*period, 0, 0, 0)[:3]
-    )
-    kind_index, arguments = (
-        KINDS.index(kind),
-        twin.NoiseArguments(twin.salts(seed), (x, y, z), jitter, reach),
-    )
+    cells = (*period, 0, 0, 0)[:3]
+    x, y, z = (check.integer(context, "period", count, low=0, high=2**28) for count in cells)
+    kind_index, salts = KINDS.index(kind), twin.salts(seed)
     if runs_twin(backend, point_pn):
+        arguments = twin.NoiseArguments(salts, (x, y, z), jitter, reach)
         return twin.noise(point_pn, kind_index, arguments)
-    scalars = (*(salt & 0xFFFFFFFF for salt in arguments.salt), x, y, z, jitter, reach)
+    scalars = (*(salt & 0xFFFFFFFF for salt in salts), x, y, z, jitter, reach)
     return torch.ops.gvtorch.noise(point_pn.contiguous(), kind_index, *scalars)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..base import check
 from .reference import orbits as twin
-from .registry import Backend, fake_of, runs_twin, uncached_backend
+from .registry import Backend, choose_backend, fake_of, runs_twin
 
 KINDS = ("power", "fold")
 
@@ -34,9 +34,8 @@ class Orbit(NamedTuple):
             got = check.describe(like)
             raise ValueError(f"{context}: {fields[0][0]} must be float32 or float64, got {got}")
         own_fields = [("constant_3", self.constant_3, "3"), ("bailout_1", self.bailout_1, "1")]
-        check.tensors(
-            context, like.device, [(*field, like.dtype) for field in (*fields, *own_fields)]
-        )
+        typed_fields = [(*field, like.dtype) for field in fields + own_fields]
+        check.tensors(context, like.device, typed_fields)
         check.one_of(context, "kind", self.kind, KINDS)
         if self.kind == "power":
             check.integer(context, "amount", self.amount, low=2, high=64)
@@ -80,8 +79,7 @@ def orbits(point_p3: Tensor, orbit: Orbit, backend: Backend = "auto") -> Tensor:
         ValueError: A tensor of the wrong shape or dtype, or a number out of its range.
     """
     orbit.check("orbits", point_p3, [("point_p3", point_p3, "p3")])
-    tensors = (point_p3, orbit.constant_3, orbit.bailout_1)
-    if runs_twin(backend, *tensors):
+    if runs_twin(backend, point_p3, orbit.constant_3, orbit.bailout_1):
         return twin.orbits(point_p3, orbit.twin_orbit())
     return torch.ops.gvtorch.orbits(point_p3, *orbit.arguments())
 
@@ -92,15 +90,14 @@ def orbit_bounds(
     """Bounds the distances that `orbits` returns over balls of centres (k, 3) and radii (k,).
 
     Returns:
-        (2, k): lower and upper bounds of the distances of all points of a ball; (-1, inf) where
-        nothing is known.
+        (2, k): lower and upper bounds of all distances in a ball; (-1, inf) if nothing is known.
 
     Raises:
         ValueError: See `orbits`.
     """
     fields = [("center_k3", center_k3, "k3"), ("reach_k", reach_k, "k")]
     orbit.check("orbit_bounds", center_k3, fields)
-    if uncached_backend(backend, center_k3.device) == "reference":
+    if choose_backend(backend, center_k3.device) == "reference":
         return twin.orbit_bounds(center_k3, reach_k, orbit.twin_orbit())
     return torch.ops.gvtorch.orbit_bounds(center_k3, reach_k, *orbit.arguments())
 

@@ -51,26 +51,16 @@ def choose_backend(backend: str, device: torch.device) -> str:
     Raises:
         ValueError: The backend is unknown, can't be used here, or does not run on `device`.
     """
-    choose = _cached_backend if isinstance(backend, str) else uncached_backend
-    return choose(backend, device)
-
-
-def uncached_backend(backend: str, device: torch.device) -> str:
-    """Does what `choose_backend` does, for torch.compile, which warns of caches."""
     if backend not in ("auto", "reference", "cpp", "cuda"):
         raise ValueError(f"backend must be auto, reference, cpp or cuda, got {backend!r}")
     compiled = {"cpu": "cpp", "cuda": "cuda"}.get(device.type)
     if backend == "auto":
-        return compiled if compiled and not unavailable()[compiled] else "reference"
-    reason = unavailable()[backend]
-    if reason:
+        return compiled if compiled and not _reasons[compiled] else "reference"
+    if reason := _reasons.get(backend):
         raise ValueError(f"backend {backend!r} can't be used here: {reason}")
     if backend not in ("reference", compiled):
         raise ValueError(f"backend {backend!r} does not run on device {device}")
     return backend
-
-
-_cached_backend = functools.cache(uncached_backend)
 
 
 def runs_twin(backend: str, *tensors: Tensor) -> bool:
@@ -78,7 +68,7 @@ def runs_twin(backend: str, *tensors: Tensor) -> bool:
     tensors are recorded, since torch can differentiate the twin. Raises as `choose_backend` does.
     """
     needs_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    chosen = uncached_backend(backend, tensors[0].device)
+    chosen = choose_backend(backend, tensors[0].device)
     return chosen == "reference" or (needs_gradient and backend == "auto")
 
 
@@ -92,32 +82,26 @@ def op(
     name or the twin itself, as the argument `backend` says: auto, reference, cpp or cuda.
 
     Tensors must be contiguous, on one device, of the dtype that their annotation names (Words,
-    Longs, Requests, Flags, Bytes or Doubles) and of the shape in the suffix of their name (any
-    shape without one); numbers must be in their range. Else the op raises ValueError. `extra_check`
-    is a further check, which gets the arguments by name. `fake` and `gradients`: see `fake_of`.
+    Longs, Requests, Flags, Bytes or Doubles) and of the shape in the suffix of their name; numbers
+    must be in their range. Else the op raises ValueError. `extra_check` is a further check, which
+    gets the arguments by name. `fake` and `gradients`: see `fake_of`.
     """
 
     def decorate(twin: _Twin) -> _Twin:
         op_name, signature = twin.__name__, inspect.signature(twin)
         fake_of(op_name, gradients=gradients)(fake)
         names = [name for name in signature.parameters if name != "backend"]
-        hints = get_type_hints(twin, include_extras=True).items()
-        annotations = {
-            name: get_args(hint)[1] for name, hint in hints if get_origin(hint) is Annotated
-        }
-        annotations |= {name: _INT64 for name, hint in hints if hint is int}
-        ranges = {
-            name: annotation
-            for name, annotation in annotations.items()
-            if isinstance(annotation, range)
-        }
-        flags = [name for name, hint in hints if hint is bool]
-        positions = {name: position for position, name in enumerate(names)}
+        hints = get_type_hints(twin, include_extras=True)
+        places = list(enumerate(names))
+        kinds = {name: _INT64 if hints[name] is int else hints[name] for name in names}
+        kinds |= {n: get_args(k)[1] for n, k in kinds.items() if get_origin(k) is Annotated}
+        ranges = [(place, name) for place, name in places if isinstance(kinds[name], range)]
+        flags = [(place, name) for place, name in places if kinds[name] is bool]
         tensors = [
-            (positions[name], name, check.shape_of(name) if "_" in name else "", dtype)
+            (place, name, check.shape_of(name), dtype)
             for dtype in _DTYPES
-            for name, annotation in annotations.items()
-            if annotation == dtype
+            for place, name in places
+            if kinds[name] == dtype
         ]
 
         @functools.wraps(twin)
@@ -128,21 +112,16 @@ def op(
                 bound.apply_defaults()
                 args = list(bound.arguments.values())[: len(names)]
             device = check.instance(op_name, names[0], args[0], Tensor).device
-            fields = [
-                (name, args[position], shape or _any_shape(op_name, name, args[position]), dtype)
-                for position, name, shape, dtype in tensors
-            ]
+            fields = [(name, args[place], shape, dtype) for place, name, shape, dtype in tensors]
             check.tensors(op_name, device, fields)
-            for position, name, _, dtype in tensors:
+            for name, value, _, dtype in fields:
                 if dtype == torch.float64:
-                    check.no_gradient(op_name, name, args[position])
-            for name, allowed in ranges.items():
-                position = positions[name]
-                args[position] = check.integer(
-                    op_name, name, args[position], low=allowed[0], high=allowed[-1]
-                )
-            for name in flags:
-                check.instance(op_name, name, args[positions[name]], bool)
+                    check.no_gradient(op_name, name, value)
+            for place, name in ranges:
+                low, high = kinds[name][0], kinds[name][-1]
+                args[place] = check.integer(op_name, name, args[place], low=low, high=high)
+            for place, name in flags:
+                check.instance(op_name, name, args[place], bool)
             if extra_check is not None:
                 extra_check(**dict(zip(names, args, strict=True)))
             if choose_backend(backend, device) == "reference":
@@ -199,7 +178,7 @@ def _register_fake(op: Any, fake: Callable[..., Any]) -> None:
 
 def _refuse_gradients(op: Any) -> None:
     """Makes an op without a backward raise where an input requires a gradient: its outputs would
-    require one too, and yield None. Autograd calls this in every mode: eager, script, compile and
+    require one too, and yield None. Autograd calls this in every mode: eager, script, compile,
     export.
     """
     names = argument_names(op)
@@ -215,7 +194,3 @@ def _refuse_gradients(op: Any) -> None:
         return op.default.redispatch(dispatch_keys & torch._C._after_autograd_keyset, *args)
 
     _libraries[namespace].impl(op_name, kernel, "Autograd", with_keyset=True)
-
-
-def _any_shape(context: str, name: str, value: Any) -> str:
-    return "abcd"[: check.instance(context, name, value, Tensor).dim()]

@@ -252,9 +252,6 @@ def _composite_gradient(
 
 
 if not unavailable()["cpp"]:
-    torch.library.register_autograd(
-        "gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples
-    )
-    torch.library.register_autograd(
-        "gvtorch::composite", _composite_gradient, setup_context=_save_composite
-    )
+    register = torch.library.register_autograd
+    register("gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples)
+    register("gvtorch::composite", _composite_gradient, setup_context=_save_composite)

@@ -4,11 +4,9 @@ them; the torch twin and csrc/shaders/shaders.h read them.
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import IntEnum
-from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 import torch
@@ -45,13 +43,7 @@ class LightKind(IntEnum):
     POINT = 2  # a position
 
 
-_Record = TypeVar("_Record")
-
-
-@cache
-def _parameter_count(record: Callable[..., Any]) -> int:
-    return len(inspect.signature(record).parameters)
-
+_Record = TypeVar("_Record", bound=NamedTuple)
 
 #: How many numbers each field of `ShadeParameters` takes, in order.
 _WIDTHS = (3, 1, 3, 1, 1, 1, 1, 1, 4, 1, 1, 1, 1)
@@ -76,20 +68,19 @@ class ShadeParameters(NamedTuple):
 
     def pack(self, dtype: torch.dtype, device: torch.device) -> Tensor:
         """Returns (5, 4) numbers; raises ValueError as the function `pack` does."""
-        own_index = self._fields.index("own")
-        own_numbers = (*self.own, *(0.0,) * (_WIDTHS[own_index] - len(self.own)))
-        return pack(
-            (*self[:own_index], *own_numbers, *self[own_index + 1 :]), dtype, device
-        ).reshape(5, 4)
+        index = self._fields.index("own")
+        own_numbers = (*self.own, *(0.0,) * (_WIDTHS[index] - len(self.own)))
+        parts = (*self[:index], *own_numbers, *self[index + 1 :])
+        return pack(parts, dtype, device).reshape(5, 4)
 
-    def own_as(self, record: Callable[..., _Record]) -> _Record:
+    def own_as(self, record: type[_Record]) -> _Record:
         """Returns the shader-specific numbers by name, as a record of theirs."""
-        return record(*self.own[: _parameter_count(record)])
+        return record(*self.own[: len(record._fields)])
 
     @classmethod
     def read(cls, parameter_54: Tensor) -> ShadeParameters:
         """Returns packed numbers by name, as views of shape () or (k,)."""
-        parts = parameter_54.reshape(-1)[: sum(_WIDTHS)].split(_WIDTHS)[: len(cls._fields)]
+        parts = parameter_54.reshape(-1)[: sum(_WIDTHS)].split(_WIDTHS)
         return cls(*(part if len(part) > 1 else part[0] for part in parts))
 
 

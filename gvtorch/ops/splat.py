@@ -104,9 +104,8 @@ def shares(edge_ke: Tensor, center_k: Tensor, radius_k: Tensor) -> Tensor:
 
 def _rows_by_turn(begin_b: Tensor, run_s2: Tensor, rows: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yields all cubes' first rows, then their second, ...: the cubes that have one, the rows."""
-    runs, cube_of_run = _expand_spans(
-        torch.stack((begin_b[:-1], begin_b[1:]), 1).clamp(0, len(run_s2))
-    )
+    run_span_k2 = torch.stack((begin_b[:-1], begin_b[1:]), 1).clamp(0, len(run_s2))
+    runs, cube_of_run = _expand_spans(run_span_k2)
     row, run_of_row = _expand_spans(run_s2.clamp(0, rows)[runs])
     count = torch.bincount(cube_of_run[run_of_row], minlength=len(begin_b) - 1)
     begin = count.cumsum(0) - count
@@ -120,7 +119,6 @@ def _expand_spans(span_k2: Tensor) -> tuple[Tensor, Tensor]:
     begin, end = span_k2.unbind(1)
     count = (end - begin).clamp(min=0)
     span_index = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
-    offset = (
-        torch.arange(len(span_index), device=count.device) - (count.cumsum(0) - count)[span_index]
-    )
+    first = count.cumsum(0) - count
+    offset = torch.arange(len(span_index), device=count.device) - first[span_index]
     return begin[span_index] + offset, span_index

@@ -31,8 +31,7 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
     """Checks rays."""
     names = "origin_r3 direction_r3 cone_r2 range_r2"
     names += "" if rays.clear_r is None else " clear_r"
-    fields = _fields(rays, torch.float64, names)
-    sizes = check.tensors(context, rays.origin_r3.device, fields)
+    sizes = check.tensors(context, rays.origin_r3.device, _fields(rays, torch.float64, names))
     check.integer(context, "width", rays.width, low=0)
     if rays.width and sizes["r"] % rays.width:
         raise ValueError(f"{context}: {sizes['r']} rays are not whole rows of {rays.width} pixels")
@@ -47,9 +46,7 @@ def check_channel(context: str, arguments: TraceArguments, device: torch.device)
     sizes = check.tensors(context, device, placement + fields)
     depth = check.integer(context, "max_depth", arguments.max_depth, low=0, high=62)
     if n**depth > config.MOST_NODES:
-        raise ValueError(
-            f"{context}: branching {n} and max_depth {depth} make more than 2^50 nodes a side"
-        )
+        raise ValueError(f"{context}: over 2^50 nodes a side: branching {n}, max_depth {depth}")
     check.integer(context, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
     check.number(context, "root_voxel", arguments.root_voxel, low=0, open_low=True)
     check.number(context, "step", arguments.step, low=0, open_low=True)

@@ -76,18 +76,14 @@ def voxelize(
     check.no_gradient(context, "corner_f33", corner_f33)
     if not corner_f33.numel():
         raise ValueError(f"{context}: corner_f33 must hold at least one triangle")
-    check.tensors(
-        context,
-        device,
-        (
-            ("corner_f33", corner_f33, "f33", dtype),
-            ("solid_f", solid_f, "f", torch.bool),
-            ("low_k3", low_k3, "k3", dtype),
-            ("size_k3", size_k3, "k3", dtype),
-            ("box_n6", box_n6, "n6", dtype),
-        ),
-        {"n": boxes_of(len(corner_f33))},
+    fields = (
+        ("corner_f33", corner_f33, "f33", dtype),
+        ("solid_f", solid_f, "f", torch.bool),
+        ("low_k3", low_k3, "k3", dtype),
+        ("size_k3", size_k3, "k3", dtype),
+        ("box_n6", box_n6, "n6", dtype),
     )
+    check.tensors(context, device, fields, {"n": boxes_of(len(corner_f33))})
     side = check.integer(context, "side", side, low=1, high=MAX_CUBE_SIDE)
     thickness = check.number(context, "thickness", thickness, low=0)
     detail = check.number(context, "detail", detail, low=0)

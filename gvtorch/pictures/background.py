@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +40,8 @@ class Gradient(Background):
 
     def __init__(self, top: Color, bottom: Color) -> None:
         """Takes two colours, linear RGB, finite and >= 0."""
-        self.ends = [_color("Gradient", "top", top), _color("Gradient", "bottom", bottom)]
+        ends = {"top": top, "bottom": bottom}
+        self.ends = [check.triple("Gradient", name, end, low=0) for name, end in ends.items()]
 
     def __repr__(self) -> str:
         top, bottom = self.ends
@@ -110,12 +109,9 @@ class Environment(Background):
             raise ValueError("Environment: image must be finite, got NaN or infinity")
         self.image = image
         identity = torch.eye(3, dtype=torch.float64, device="cpu")
-        self.rotation = (
-            identity if rotation is None else torch.as_tensor(rotation, device="cpu").to(identity)
-        )
-        if self.rotation.shape != (3, 3) or not torch.allclose(
-            self.rotation @ self.rotation.mT, identity, atol=1e-3
-        ):
+        given = identity if rotation is None else rotation
+        self.rotation = check.reals("Environment", "rotation", given, (3, 3))
+        if not torch.allclose(self.rotation @ self.rotation.mT, identity, atol=1e-3):
             raise ValueError("Environment: rotation must be (3, 3) and orthonormal")
         self._uploaded: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
 
@@ -149,8 +145,7 @@ class Environment(Background):
         return colors[0, :, 0].mT
 
     def behind(self, camera: Camera, numbers: Tensor, dtype: torch.dtype) -> Tensor:
-        blocks = camera.blocks(_PIXELS_A_BLOCK)
-        rays = (camera.pixel_rays(numbers, rows) for rows in blocks)
+        rays = (camera.pixel_rays(numbers, rows) for rows in camera.blocks(_PIXELS_A_BLOCK))
         return torch.cat([self.look_up(block_rays.direction, dtype) for block_rays in rays])
 
 
@@ -160,14 +155,7 @@ def checked_background(context: str, value: Any) -> Background | Color | None:
         return value
     if isinstance(value, Tensor) and value.dim() > 1:
         return Backdrop(value)
-    return _color(context, "background", value, high=1)
-
-
-def _color(context: str, name: str, value: Sequence[float], high: float = math.inf) -> Color:
-    color = check.triple(context, name, value)
-    for number in color:
-        check.number(context, name, number, low=0, high=high)
-    return color
+    return check.triple(context, "background", value, low=0, high=1)
 
 
 def _by_pixel(image: Tensor, camera: Camera) -> Tensor:

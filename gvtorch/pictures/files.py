@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..base import check
 from ..base.messages import need_library, one_line
 from ..base.whole_file import save_npy, whole_file
 from .tone import finite, to_srgb
@@ -38,11 +39,11 @@ def checked_path(
     one of `suffixes` or does not allow `bits`, FileNotFoundError if there is no such folder.
     """
     if path.suffix not in suffixes:
-        expected = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
+        expected = check.either(suffixes)
         raise ValueError(f"{context}: path must end in {expected}, got {str(path)!r}")
     allowed_bits = _BITS[path.suffix]
     if bits is not None and bits not in allowed_bits:
-        choices = " or ".join(str(n) for n in allowed_bits)
+        choices = check.either(map(str, allowed_bits))
         raise ValueError(f"{context}: {path.suffix} has {choices} bits, got {bits!r}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{context}: folder not found: {path.parent}")
@@ -82,10 +83,7 @@ def _as_os_errors() -> Iterator[None]:
 
 def side_by_side(layers: Layers) -> Layers:
     """Joins the pictures of a batch to one, side by side."""
-    return {
-        name: np.concatenate(layer, 1) if layer.ndim == 4 else layer
-        for name, layer in layers.items()
-    }
+    return {n: np.concatenate(x, 1) if x.ndim == 4 else x for n, x in layers.items()}
 
 
 def stacked(layers: Layers) -> np.ndarray:
@@ -143,10 +141,8 @@ def write_png_rows(
     with path.open("wb") as file:
 
         def chunk(kind: bytes, content: bytes) -> None:
-            checksum = zlib.crc32(kind + content)
-            file.write(
-                struct.pack(">I", len(content)) + kind + content + struct.pack(">I", checksum)
-            )
+            size, checksum = len(content), zlib.crc32(kind + content)
+            file.write(struct.pack(">I", size) + kind + content + struct.pack(">I", checksum))
 
         file.write(b"\x89PNG\r\n\x1a\n")
         color_type = {3: 2, 4: 6}[channels]
@@ -155,13 +151,11 @@ def write_png_rows(
             rows = strip.astype(f">u{bits // 8}").reshape(len(strip), -1).view(np.uint8)
             left_difference = rows.copy()
             left_difference[:, pixel_bytes:] -= rows[:, :-pixel_bytes]
-            filtered = np.stack(
-                (rows, left_difference, rows - np.concatenate((row_above, rows[:-1])))
-            )
+            up_difference = rows - np.concatenate((row_above, rows[:-1]))
+            filtered = np.stack((rows, left_difference, up_difference))
             row_above = rows[-1:]
-            best_filter = (
-                np.abs(filtered.view(np.int8).astype(np.int16)).sum(2, dtype=np.int64).argmin(0)
-            )
+            sizes = np.abs(filtered.view(np.int8).astype(np.int16)).sum(2, dtype=np.int64)
+            best_filter = sizes.argmin(0)
             best_rows = filtered[best_filter, np.arange(len(rows))]
             lines = np.column_stack((best_filter.astype(np.uint8), best_rows))
             if compressed := compressor.compress(lines.tobytes()):
@@ -177,9 +171,7 @@ def write_tiff(
     strips: Iterable[np.ndarray],
     rows: int,
 ) -> None:
-    """Writes a BigTIFF (h, w, c), c 3, or 4 with alpha, strip by strip, (rows, w, c); the last
-    strip may have fewer rows.
-    """
+    """Writes a BigTIFF in strips of `rows` rows, the last perhaps fewer; see `write_png_rows`."""
     tifffile = need_library(".tif", "tifffile", extra="image")
     alpha_kind = "assocalpha" if dtype.kind == "f" else "unassalpha"
     with tifffile.TiffWriter(path, bigtiff=True) as file:

@@ -85,6 +85,8 @@ class Overlay:
             ValueError: The picture is too small for them, or a number is out of its range.
             ImportError: Pillow is not installed.
         """
+        width = check.integer("Overlay", "width", width, low=1)
+        height = check.integer("Overlay", "height", height, low=1)
         self._size = (width, height)
         self._pen = _Pen(max(_MIN_LETTER_SIZE, round(min(width, height) / _LETTERS_PER_SIDE)))
         self._stamps: list[_Stamp] = []
@@ -93,9 +95,8 @@ class Overlay:
         if pixel is not None:
             pixel = check.number("Overlay", "pixel", pixel, low=0, open_low=True)
             image = self._pen.scale_bar(_SCALE_FRACTION * width, pixel, unit)
-            self._add_stamp(
-                image, top=height - image.shape[0] - self._pen.size, left=self._pen.size
-            )
+            top = height - image.shape[0] - self._pen.size
+            self._add_stamp(image, top=top, left=self._pen.size)
         if bar is not None:
             image = self._pen.color_bar(bar, round(_BAR_FRACTION * height))
             top = (height - image.shape[0]) // 2
@@ -125,9 +126,7 @@ class Overlay:
         """
         height, width = picture.color.shape[-3:-1]
         if picture.color.dim() != 3 or width != self._size[0]:
-            raise ValueError(
-                f"Overlay: the picture must be {self._size[0]} wide, got {width}x{height}"
-            )
+            raise ValueError(f"Overlay: picture must be {self._size[0]} wide, got {width}x{height}")
         color, alpha = picture.color.clone(), picture.alpha.clone()
         for stamp in self._stamps:
             top, bottom = max(stamp.top, first), min(stamp.top + len(stamp.alpha), first + height)
@@ -135,10 +134,8 @@ class Overlay:
                 continue
             rows = slice(top - stamp.top, bottom - stamp.top)
             coverage, stamp_color = stamp.alpha[rows].to(color), stamp.color[rows].to(color)
-            region = (
-                slice(top - first, bottom - first),
-                slice(stamp.left, stamp.left + coverage.shape[1]),
-            )
+            columns = slice(stamp.left, stamp.left + coverage.shape[1])
+            region = (slice(top - first, bottom - first), columns)
             color[region] = color[region] * (1 - coverage) + stamp_color * coverage
             alpha[region] = alpha[region] * (1 - coverage) + coverage
         return replace(picture, color=color, alpha=alpha)
@@ -183,13 +180,8 @@ class _Pen:
     def _warn_of_missing(self, text: str) -> None:
         """Warns of characters that the font lacks and draws as boxes."""
         placeholder = bytes(self._font.getmask("\uffff"))
-        missing = sorted(
-            {
-                letter
-                for letter in text
-                if letter.strip() and bytes(self._font.getmask(letter)) == placeholder
-            }
-        )
+        letters = sorted({letter for letter in text if letter.strip()})
+        missing = [n for n in letters if bytes(self._font.getmask(n)) == placeholder]
         if missing:
             warnings.warn(f"the font of pictures has no {' '.join(missing)}", stacklevel=4)
 
@@ -200,9 +192,8 @@ class _Pen:
         label = f"{length:g} {unit_symbol(unit)}".rstrip()
         rim, tick = self._rim, round(0.5 * self.size)
         label_width = self._text_width(label)
-        sheet, draw = self._new_sheet(
-            max(width, label_width) + 2 * (rim + self._line), 2.3 * self.size + 2 * rim
-        )
+        sheet_width = max(width, label_width) + 2 * (rim + self._line)
+        sheet, draw = self._new_sheet(sheet_width, 2.3 * self.size + 2 * rim)
         left, right = rim + self._line, rim + self._line + width
         base = sheet.height - rim - self._line - 1
         lines: list[Any] = [((left, base), (right, base))]

@@ -82,9 +82,8 @@ class Picture:
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Picture:
         """Returns the picture on a device; its floats in another dtype. None leaves each as is."""
-        return replace(
-            self, **{name: to_device(value, device, dtype) for name, value in vars(self).items()}
-        )
+        fields = vars(self).items()
+        return replace(self, **{name: to_device(value, device, dtype) for name, value in fields})
 
     def show(self) -> None:
         """Shows the picture: in a notebook below the cell, else as a PNG in the system's viewer.
@@ -113,8 +112,7 @@ class Picture:
         return {name: layer.detach().cpu().numpy() for name, layer in layers.items()}
 
     def save(self, path: str | Path, *, bits: int | None = None) -> None:
-        """Writes a file, whole or not at all. The pictures of a batch are laid side by side, except
-        in NumPy files.
+        """Writes a file, whole or not at all. A batch is laid side by side, except in NumPy files.
 
         - .png: sRGB, 8 or 16 bits; with straight alpha if the picture is transparent.
         - .tif: the same, or 32 bits: linear float, premultiplied (BigTIFF, Deflate).

@@ -115,22 +115,15 @@ class Progressive:
         else:
             has_mean = self._complete_frames > 0
             # A pixel without a whole frame yet shows the newest one; others add whole frames only.
-            self._sum = torch.where(
-                has_mean, torch.where(complete, self._sum + rgba, self._sum), rgba
-            )
+            mean_sum = torch.where(complete, self._sum + rgba, self._sum)
+            self._sum = torch.where(has_mean, mean_sum, rgba)
             for name, image in centre_layers.items():
                 self._centre_layers[name] = torch.where(has_mean, self._centre_layers[name], image)
             self._complete_frames = self._complete_frames + complete
         self.count += 1
         mean = (self._sum / self._complete_frames.clamp(min=1)).to(picture.color.dtype)
-        color, alpha = mean[..., :3], mean[..., 3:]
-        return replace(
-            picture,
-            color=color,
-            alpha=alpha,
-            missed=self._complete_frames == 0,
-            **self._centre_layers,
-        )
+        layers = {"color": mean[..., :3], "alpha": mean[..., 3:], **self._centre_layers}
+        return replace(picture, missed=self._complete_frames == 0, **layers)
 
     def refine(self, camera: Camera | Rays, samples: int) -> Picture:
         """Renders frames, at least one, until there are `samples` of this camera, and returns their
@@ -178,8 +171,7 @@ def render_tiles(
         Statistics of the last strip, but milliseconds, rays and samples summed over all strips.
 
     Raises:
-        ValueError: The path ends in none of these, the camera is a batch, or an argument is out of
-            range.
+        ValueError: The path ends in none of these, the camera is a batch, or a number is wrong.
         FileNotFoundError: The folder does not exist.
         ImportError: .tif without tifffile.
     """
@@ -225,10 +217,7 @@ def _write_strips(
             for picture in all_strips:
                 file.write(stacked(picture.layers()).astype("<f4").tobytes())
         return
-    pixels = (
-        file_pixels(side_by_side(picture.layers()), picture.transparent, bits)
-        for picture in all_strips
-    )
+    pixels = (file_pixels(side_by_side(p.layers()), p.transparent, bits) for p in all_strips)
     shape = (*size, 4 if first.transparent else 3)
     if suffix == ".png":
         write_png_rows(part, shape, bits, pixels)

@@ -56,8 +56,7 @@ class Video:
         if suffix == ".mp4" and (width % 2 or height % 2):
             raise ValueError(f"Video: size must be even for .mp4, got {width}x{height}")
         self._stack: ExitStack | None = None  # while the film is open
-        is_mp4 = suffix == ".mp4"
-        self._film = _Mp4(width, height, fps) if is_mp4 else _LoopingFilm(suffix, fps)
+        self._film = _Mp4(width, height, fps) if suffix == ".mp4" else _LoopingFilm(suffix, fps)
 
     def add(self, picture: Picture) -> None:
         """Appends a picture.
@@ -139,18 +138,15 @@ class _LoopingFilm:
         if not complete or not self._frames:
             return
         unit_ms = 10 if self._suffix == ".gif" else 1  # a GIF counts in hundredths of a second
-        ends = [
-            round(1000 * n / self._fps / unit_ms) * unit_ms for n in range(len(self._frames) + 1)
-        ]
-        durations = [b - a for a, b in itertools.pairwise(ends)]
         frames = self._frames
+        ends = [round(1000 * n / self._fps / unit_ms) * unit_ms for n in range(len(frames) + 1)]
+        durations = [b - a for a, b in itertools.pairwise(ends)]
         options: dict[str, Any] = {"quality": 90, "method": 4}
         if self._suffix == ".gif":
             frames, options = self._in_palette(), {"optimize": False, "disposal": 1}
         first, *rest = frames
-        first.save(
-            self._part, save_all=True, append_images=rest, duration=durations, loop=0, **options
-        )
+        options |= {"append_images": rest, "duration": durations, "loop": 0}
+        first.save(self._part, save_all=True, **options)
 
     def _in_palette(self) -> list[Any]:
         """Returns the frames in 256 colours common to all, so that still parts do not flicker."""

@@ -8,7 +8,6 @@ defines what it does with an interval; its torch twin in ops/reference/shaders.p
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import copy
 from typing import Any, ClassVar, Literal, Self, Unpack
 
 import torch
@@ -70,11 +69,7 @@ _OPAQUE_LENGTH = 1e-20  # a reference length so short that any opacity above 0 b
 
 
 class Lit(LitShader):
-    """The transfer function with Blinn-Phong lighting on both sides of a surface.
-
-    Attributes:
-        in_the_way: Shader whose alpha blocks the cones of `Lighting`; None: the transfer function.
-    """
+    """The transfer function with Blinn-Phong lighting on both sides of a surface."""
 
     kind = "Lit"
     shadowed_kind = "ShadowedLit"
@@ -115,9 +110,7 @@ class Lit(LitShader):
 
 
 class PreIntegrated(Shader):
-    """The transfer function, integrated over the values between two samples, so that thin peaks of
-    the function need no finer steps.
-    """
+    """The transfer function, integrated between two samples: thin peaks need no finer steps."""
 
     kind = "PreIntegrated"
     transfer: TransferFunction
@@ -179,26 +172,19 @@ class StoredColor(LitShader):
         self.lit, self.shadows = lit or self.normals is not None, shadows
 
     def own_numbers(self, tree: N3Tree) -> StoredColorNumbers:
-        scale = 1 / number_of_one(tree.bricks.channels[str(self.channel)].dtype)
-        reference = self.reference or min(tree.spacing)
-        directional = tree.bricks.channels[str(self.channel)].width != COLOR_WIDTH
+        channel = tree.bricks.channels[str(self.channel)]
         return StoredColorNumbers(
-            scale=scale,
-            reference=reference,
-            premultiplied=float(self.premultiplied or directional),
+            scale=1 / number_of_one(channel.dtype),
+            reference=self.reference or min(tree.spacing),
+            premultiplied=float(self.premultiplied or channel.width != COLOR_WIDTH),
             lit=self.lit or self.shadows or self.octaves > 0,
         )
 
     def unlit(self) -> Self:
-        unlit = super().unlit()
-        unlit.lit = True
-        return unlit
+        return super().unlit().changed(lit=True)
 
     def blocker(self) -> StoredColor:
-        blocker = copy(self)
-        blocker.lit = blocker.shadows = False
-        blocker.octaves = 0
-        return blocker
+        return self.changed(lit=False, shadows=False, octaves=0)
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         widths = channel_widths(COLOR_WIDTH)
@@ -277,10 +263,8 @@ class Isosurface(LitShader):
 
     def _check_color(self) -> None:
         if (self.color is None or isinstance(self.color, TransferFunction)) == (self.other is None):
-            kind = class_name(self)
-            raise ValueError(
-                f"{kind}: a transfer function or color=None and color_channel belong together"
-            )
+            parts = "a transfer function or color=None and color_channel"
+            raise ValueError(f"{class_name(self)}: {parts} belong together")
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         self._check_color()
@@ -301,9 +285,7 @@ class Isosurface(LitShader):
         return IsosurfaceNumbers(self.value, filled, scale, float(self.premultiplied))
 
     def opened(self) -> Isosurface:
-        hollow = copy(self)
-        hollow.filled = False
-        return hollow
+        return self.changed(filled=False)
 
     def matter(self) -> WideIsosurface:
         if self.color is None or isinstance(self.color, TransferFunction):
@@ -331,9 +313,7 @@ class Isosurface(LitShader):
 
 
 class DistanceField(Isosurface):
-    """The surface of a signed distance field: where the distance is `offset`, by default 0. The
-    inside is where it is smaller.
-    """
+    """The surface of a signed distance field, where it is `offset`; inside, it is smaller."""
 
     distance = True
     offset = also_called("value")
@@ -374,9 +354,8 @@ class WideIsosurface(Shader):
         dtype, device = sampling.dtype, sampling.device
         value_1 = pack((self.level,), dtype, device)
         if self.distance:
-            half_domain_1 = torch.full_like(
-                value_1, _MAX_RAMP_VOXELS / 2 * sampling.smallest_spacing
-            )
+            half_width = _MAX_RAMP_VOXELS / 2 * sampling.smallest_spacing
+            half_domain_1 = torch.full_like(value_1, half_width)
             slope_1 = torch.ones_like(value_1)
         else:
             half_domain_1 = value_1.abs() / 2
@@ -384,14 +363,12 @@ class WideIsosurface(Shader):
         # At least so wide that the ramp is not a jump.
         half_domain_1 = torch.maximum(half_domain_1, 1e-5 * value_1.abs().clamp(min=1))
         length_l = sampling.step * 2 ** torch.arange(sampling.levels, dtype=dtype, device=device)
-        half_ramp_l = torch.minimum(
-            (_RAMP_INTERVALS / 2 * slope_1 * length_l).clamp(min=1e-30), half_domain_1
-        )
+        half_ramp_l = (_RAMP_INTERVALS / 2 * slope_1 * length_l).clamp(min=1e-30)
+        half_ramp_l = torch.minimum(half_ramp_l, half_domain_1)
         offset_m = half_domain_1 * torch.linspace(-1, 1, _RAMP_ROWS, dtype=dtype, device=device)
         inside_m = -offset_m if self.distance else offset_m
-        table = (
-            pack((self.color, 0.0), dtype, device).expand(sampling.levels, _RAMP_ROWS, 4).clone()
-        )
+        color_4 = pack((self.color, 0.0), dtype, device)
+        table = color_4.expand(sampling.levels, _RAMP_ROWS, 4).clone()
         fraction_lm = (0.5 + inside_m / (2 * half_ramp_l[:, None])).clamp(0, 1)
         # A cone that grazes a surface meets it in about four intervals, so each gets a quarter of
         # the optical depth.
@@ -413,6 +390,7 @@ class Projection(Shader):
     kind = "Projection"
     whole_ray = True
     which: Literal["maximum", "minimum", "mean"]
+    projection = also_called("which")
     checks: ClassVar[Mapping[str, Check]] = {
         "which": lambda owner, name, value: _projection(value),
         "transfer": _TRANSFER_CHECK,
@@ -430,10 +408,6 @@ class Projection(Shader):
         """
         self.which = which  # type: ignore[assignment]
         self.transfer = transfer
-
-    @property
-    def projection(self) -> Literal["maximum", "minimum", "mean"]:
-        return self.which
 
     def own_numbers(self, tree: N3Tree) -> ProjectionNumbers:
         return ProjectionNumbers(ProjectionKind[self.which.upper()])

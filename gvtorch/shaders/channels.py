@@ -52,8 +52,7 @@ class ChannelLook:
         window: (low, high) in data units: values at which it begins to show, and is brightest.
         component: Index of the number of a voxel; None: the channel's index in the list.
         visible: Whether it is shown.
-        opacity: At the window's upper end, over an interval as long as the smallest spacing; 0.5 if
-            left out.
+        opacity: At the window's upper end, over a length of the smallest spacing; 0.5 if left out.
         name: Name for display.
     """
 
@@ -81,19 +80,15 @@ class ChannelLook:
                     raise ValueError(f"{context}: it has a transfer function, so no {name}")
             return check.instance(context, "transfer", self.transfer, TransferFunction)
         if self.window is None:
-            raise ValueError(
-                f"{context}: window=(low, high) or a transfer function is missing; "
-                "Channels.of(volume) finds windows"
-            )
+            missing = "window=(low, high) or a transfer function is missing"
+            raise ValueError(f"{context}: {missing}; Channels.of(volume) finds windows")
         low, high = window_of(context, self.window)
         default = DEFAULT_COLORS[index] if count > 1 else "white"
         color = channel_color(context, default if self.color is None else self.color)
         opacity = _DEFAULT_OPACITY if self.opacity is None else self.opacity
         opacity = check.number(context, "opacity", opacity, low=0, high=1)
         fractions = [piece / _RAMP_PIECES for piece in range(_RAMP_PIECES)]
-        rising = [
-            (low + fraction * (high - low), opacity * fraction * fraction) for fraction in fractions
-        ]
+        rising = [(low + share * (high - low), opacity * share * share) for share in fractions]
         return TransferFunction([*rising, (high, opacity)], [(low, 0, 0, 0), (high, *color)])
 
 
@@ -117,10 +112,6 @@ class Channels(Shader):
 
     The numbers are those of one channel of the pool, in any order. Coarse levels hold means, as for
     other shaders; there is no `Filtered` variant.
-
-    Attributes:
-        looks: The looks, in order; the list itself may also be edited.
-        mode: "additive" or "opacity".
     """
 
     kind = "ChannelMix"
@@ -135,7 +126,7 @@ class Channels(Shader):
         """Sets the looks; a transfer function is short for a look with only that.
 
         Args:
-            looks: 1 to 16 of them.
+            looks: 1 to 16 of them, in order; the attribute is a list that may be edited, too.
             mode: How they are combined.
             channel: Name of the pool's channel; None: that of the options.
 
@@ -172,9 +163,7 @@ class Channels(Shader):
         Raises:
             ValueError: There are more than 16, or the image lacks one of `components`.
         """
-        if not isinstance(image, Volume | Store):
-            kind = type(image).__name__
-            raise ValueError(f"Channels.of: image must be a Volume or a Store, got {kind}")
+        check.instance("Channels.of", "image", image, Volume, Store)
         width = image.width
         chosen = range(width) if components is None else components
         chosen = check.items("Channels.of", "components", chosen)
@@ -212,10 +201,8 @@ class Channels(Shader):
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the header and the rows of all channels, see csrc/shaders/channels.h."""
         functions = self._visible_functions()
-        function_keys = [
-            (c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in functions
-        ]
-        key = (self.mode, *function_keys, sampling)
+        keys = [(c, f.opacity.tobytes(), f.color.tobytes(), f.reference) for c, f in functions]
+        key = (self.mode, *keys, sampling)
         if key not in self._tables:
             self._tables = {key: _make_table(functions, self.mode == "additive", sampling)}
         return self._tables[key]
@@ -266,9 +253,8 @@ def _make_table(
         with np.errstate(divide="ignore"):
             (length,) = sampling.lengths(function.reference, 1)
             halvings = np.log1p(-rows[:, 3]) * (-length / math.log(2))
-        table[:, row_slice, 3] = (
-            np.minimum(halvings, _OPAQUE_HALVINGS) * 2.0 ** np.arange(levels)[:, None]
-        )
+        halvings = np.minimum(halvings, _OPAQUE_HALVINGS)
+        table[:, row_slice, 3] = halvings * 2.0 ** np.arange(levels)[:, None]
         opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0)
         used_rows += len(rows)
     dtype, device = sampling.dtype, sampling.device

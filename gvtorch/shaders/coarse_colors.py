@@ -10,13 +10,14 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from ..base import boxes
 from ..base.stage import Progress
-from ..base.volume import DIRECTIONS, Volume, movable
+from ..base.volume import DIRECTIONS, Volume, to_numpy
 from ..ops.shading import COLOR_WIDTH, FAINT, LIT_COLOR_WIDTH
 from .shader import ColorTable, row_and_fraction
 
@@ -41,21 +42,15 @@ class VolumeField:
     slab_side = 256
 
     def __init__(self, volume: Volume, component: int) -> None:
-        self._values = volume.data[..., component].cpu()
+        self._values = to_numpy(volume.data[..., component])
         z, y, x = self._values.shape
         self.shape = (z, y, x)
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
         """See `FinestVoxels`."""
-        box = movable(self._values)
-        for axis, (first, end, size) in enumerate(zip(low, high, self.shape, strict=True)):
-            if first >= 0 and end <= size:
-                box = box.narrow(axis, first, end - first)
-            else:
-                box = box.index_select(
-                    axis, torch.arange(first, end, device="cpu").clamp(0, size - 1)
-                )
-        return box.view(self._values.dtype)
+        start, stop = boxes.clamped_box(low, high, self.shape)
+        part = self._values[boxes.index(start, stop)]
+        return torch.from_numpy(boxes.repeat_edges(part, start, low, high))
 
 
 def write_colors(
@@ -84,15 +79,12 @@ def write_colors(
         column_axis, length_ratio = 2 - axis, min(spacing) / spacing[axis]
         sizes = [spacing[2 - a] for a in (column_axis, *(a for a in range(3) if a != column_axis))]
         painter = _Painter(table, sizes if numbers == LIT_COLOR_WIDTH + 1 else None, column_axis)
-        axis_levels = [
-            level.unflatten(-1, (len(DIRECTIONS), -1))[..., 2 * axis : 2 * axis + 2, :]
-            .movedim(column_axis, 0)
-            .movedim(3, 0)
-            for level in out
-        ]  # (2, n, a, b, numbers)
-        for level, a, b, sums in _sums_along(
-            field, column_axis, painter, branching, len(out), all_light
-        ):
+        sides = slice(2 * axis, 2 * axis + 2)
+        by_side = [level.unflatten(-1, (len(DIRECTIONS), -1))[..., sides, :] for level in out]
+        # (2, n, a, b, numbers)
+        axis_levels = [level.movedim((3, column_axis), (0, 1)) for level in by_side]
+        blocks = _sums_along(field, column_axis, painter, branching, len(out), all_light)
+        for level, a, b, sums in blocks:
             light = sums[:, -1:]
             means = _scaled_to_length(sums[:, :-1] / light, length_ratio)
             light_fraction = light / (2 * branching ** (level + 1)) ** 2
@@ -116,10 +108,10 @@ def _sums_along(
 ) -> Iterator[tuple[int, int, int, Tensor]]:
     """Yields blocks of coarse voxels, each voxel once, seen along an axis of the field: the level
     (0: finest coarse one), the block's first indices a, b across the axis, and weighted sums
-    (2, c + 1, n, a, b), seen forwards and backwards: the c numbers of a colour and the
-    weight.
+    (2, c + 1, n, a, b), seen forwards and backwards: the c numbers of a colour and the weight.
     """
     device = painter.table.table_lm4.device
+    float32: Any = {"dtype": torch.float32, "device": device}
     length = field.shape[column_axis]
     cross_axes = [axis for axis in range(3) if axis != column_axis]
     cross_sizes = [field.shape[axis] for axis in cross_axes]
@@ -128,21 +120,18 @@ def _sums_along(
         tile *= branching
     # Finest voxels along a side of a voxel of each level.
     level_sides = [branching ** (level + 1) for level in range(levels)]
-    coarse = {  # for levels whose voxels are wider than a tile: sums of each tile's columns
-        level: torch.zeros(
-            (2, painter.width + 1, -(-length // side), *(-(-n // tile) for n in cross_sizes)),
-            dtype=torch.float32,
-            device=device,
-        )
-        for level, side in enumerate(level_sides)
-        if side > tile
-    }
+    coarse = {}  # for levels whose voxels are wider than a tile: sums of each tile's columns
+    for level, side in enumerate(level_sides):
+        if side > tile:
+            counts = (-(-length // side), *(-(-n // tile) for n in cross_sizes))
+            coarse[level] = torch.zeros((2, painter.width + 1, *counts), **float32)
     for a, b, tile_values in _tiles(field, column_axis, tile):
         values = tile_values.to(device).to(torch.float32)
         empty = not _is_visible(values, painter.table)
         if empty:  # the fewest intervals that make up a voxel of level 0
-            height, width = (2 * n - 4 for n in tile_values.shape[1:])
-            columns = _Columns.empty(painter.width - 1, (2 * branching, height, width), device)
+            shape = (2 * branching, *(2 * n - 4 for n in tile_values.shape[1:]))
+            color = torch.zeros((painter.width - 1, *shape), **float32)
+            columns = _Columns(color, color, torch.ones(shape, **float32))
         else:
             columns = painter.colored(values)
         columns = columns.joined(2)
@@ -268,12 +257,6 @@ class _Columns:
     back: Tensor  # (c, n, a, b) the same seen from behind
     clear: Tensor  # (n, a, b) transmittance
 
-    @classmethod
-    def empty(cls, numbers: int, shape: tuple[int, ...], device: torch.device) -> _Columns:
-        """Returns intervals that hold nothing."""
-        color = torch.zeros((numbers, *shape), dtype=torch.float32, device=device)
-        return cls(color, color, torch.ones(shape, dtype=torch.float32, device=device))
-
     def joined(self, count: int) -> _Columns:
         """Composites every `count` intervals into one; the last is repeated if some are missing."""
         length = len(self.clear)
@@ -304,32 +287,29 @@ class _Columns:
         alpha = 1 - self.clear
         weighted = self.front.new_empty((2, len(self.front) + 2, *alpha.shape))
         sides = ((self.front, front_light, 1), (self.back, back_light, -1))
-        for out, (color, light, direction) in zip(weighted, sides, strict=True):
+        for out, (color, light, step) in zip(weighted, sides, strict=True):
             torch.mul(color[:3], light, out=out[:3])
             torch.mul(alpha, light, out=out[3])
             if len(color) > 3:
-                _weigh_moments(color, alpha, light, direction, out[4:-1])
+                _weigh_moments(color, alpha, light, step, out[4:-1])
             out[-1] = light
         return weighted
 
 
-def _weigh_moments(
-    color: Tensor, alpha: Tensor, light: Tensor, direction: int, out: Tensor
-) -> None:
+def _weigh_moments(color: Tensor, alpha: Tensor, light: Tensor, step: int, out: Tensor) -> None:
     """Writes the moments of intervals (c - 3, n, a, b), weighted by light. Rays also blend in the
     inside of solids, which no light reaches: there an interval takes the moments of the last one
     before it that light reaches, divided by `FAINT`, so that other directions count more.
     """
     index = torch.arange(len(alpha), device=alpha.device)[:, None, None]
     lit = light > 2 * _MIN_LIGHT
-    if direction > 0:
+    if step > 0:
         source_index = torch.where(lit, index, 0).cummax(0).values
     else:
         source_index = torch.where(lit, index, len(alpha) - 1).flip(0).cummin(0).values.flip(0)
     source_alpha = alpha.gather(0, source_index)
-    weight = light * torch.where(
-        source_alpha > 0, alpha / torch.where(source_alpha > 0, source_alpha, 1.0), 0.0
-    )
+    ratio = alpha / torch.where(source_alpha > 0, source_alpha, 1.0)
+    weight = light * torch.where(source_alpha > 0, ratio, 0.0)
     weight = torch.where(lit, weight, weight / FAINT)
     torch.gather(color[3:], 1, source_index.expand_as(out), out=out)
     out *= weight
@@ -350,9 +330,7 @@ class _Painter:
         return COLOR_WIDTH if self.voxel_sizes is None else LIT_COLOR_WIDTH
 
     def colored(self, padded_values: Tensor) -> _Columns:
-        """Returns intervals of half a voxel, coloured from (n, a + 2, b + 2) values, which have
-        neighbours on the sides.
-        """
+        """Returns intervals of half a voxel from (n, a + 2, b + 2) values, with neighbours."""
         values = _upsampled(padded_values)
         low, high = self.table.domain_2
         rows = self.table.table_lm4[0]
@@ -375,11 +353,9 @@ class _Painter:
             colors[3:] *= alpha
         return _Columns(colors, colors, 1 - alpha)
 
-    def write_moments(
-        self, padded_values: Tensor, voxel_sizes: Sequence[float], out: Tensor
-    ) -> None:
+    def write_moments(self, padded: Tensor, voxel_sizes: Sequence[float], out: Tensor) -> None:
         """Writes the products xx xy xz yy yz zz of unit normals; 0 where there is no gradient."""
-        slopes = [_upsampled(padded_values, axis) / voxel_sizes[axis] for axis in range(3)]
+        slopes = [_upsampled(padded, axis) / voxel_sizes[axis] for axis in range(3)]
         largest = torch.maximum(torch.maximum(slopes[0].abs(), slopes[1].abs()), slopes[2].abs())
         divisor = torch.where(largest > 0, largest, 1.0)
         scaled = [slope / divisor for slope in slopes]

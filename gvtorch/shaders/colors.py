@@ -33,10 +33,7 @@ def linear_color(
     three numbers in [0, 1], which are linear; raises ValueError if it is neither.
     """
     if not isinstance(value, str):
-        color = check.triple(context, "colour", value)
-        for component in color:
-            check.number(context, "colour", component, low=0, high=1)
-        return color
+        return check.triple(context, "colour", value, low=0, high=1)
     text = named.get(value.lower(), value)
     if not re.fullmatch(r"#[0-9a-fA-F]{6}", text):
         names = ", ".join(named)
@@ -57,10 +54,8 @@ def distinct_colors(numbers: np.ndarray) -> np.ndarray:
     """
     bits = numbers.astype(np.int64).view(np.uint64)
     bits = np.where(bits < _HASHED_FROM, bits, _hashed(bits))
-    hue, variation = (
-        (bits * np.uint64(step) >> np.uint64(11)) * 2.0**-53
-        for step in (_HUE_STEP, _LIGHTNESS_STEP)
-    )
+    steps = np.uint64(_HUE_STEP), np.uint64(_LIGHTNESS_STEP)
+    hue, variation = ((bits * step >> np.uint64(11)) * 2.0**-53 for step in steps)
     lightness = 0.56 + 0.30 * variation
     chroma = 0.165 - 0.05 * np.abs(2 * variation - 1)
     angle = 2 * math.pi * (hue + 0.07)

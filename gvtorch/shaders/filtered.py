@@ -18,7 +18,7 @@ weights, the colours of hidden voxels and the sums over moments are ours; see do
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -61,9 +61,7 @@ _BATCH_BRICKS = 4096  # bricks cut at a time
 def _check_filterable(owner: Any, name: str, value: Any) -> TransferFunction | Lit:
     """Checks that a value is a shader that can be filtered."""
     context = class_name(owner)
-    if not isinstance(value, TransferFunction | Lit):
-        got = type(value).__name__
-        raise ValueError(f"{context}: {name} must be a TransferFunction or a Lit, got {got}")
+    check.instance(context, name, value, TransferFunction, Lit)
     if isinstance(value, Lit) and (value.normals or value.shadows or value.octaves):
         raise ValueError(
             f"{context}: a Lit must take its normals from the gradient, without shadows per sample "
@@ -144,6 +142,7 @@ class Filtered(Shader):
         Raises:
             ValueError: Tree and volume do not belong together, or an argument is out of its range.
         """
+        check.instance("Filtered", "tree", tree, N3Tree)
         check.instance("Filtered", "volume", volume, Volume)
         check.integer("Filtered", "component", component, low=0, high=volume.width - 1)
         shader = cls(transfer, channel, component, directions=directions)
@@ -159,12 +158,10 @@ class Filtered(Shader):
             raise ValueError("Filtered: the tree's coarse bricks must come first in its pool")
         bricks, color_channel = tree.bricks, shader.colors(tree.spacing)
         side = bricks.brick_size + 2 * bricks.border
-        colors = torch.zeros(
-            (count, side, side, side, color_channel.width), dtype=color_channel.dtype, device="cpu"
-        )
+        shape = (count, side, side, side, color_channel.width)
+        colors = torch.zeros(shape, dtype=color_channel.dtype, device="cpu")
         level_arguments = (tree.branching, tree.depth, tree.device, color_channel.width)
-        levels = shader.levels(volume, *level_arguments, progress)
-        for level, values in enumerate(levels, 1):
+        for level, values in enumerate(shader.levels(volume, *level_arguments, progress), 1):
             level_rows = (locs[:count, 3] == tree.depth - level).nonzero()[:, 0]
             for rows in level_rows.split(_BATCH_BRICKS):
                 zyx = locs[rows, :3].flip(1)
@@ -324,12 +321,8 @@ class Filtered(Shader):
         progress: Progress = no_progress,
     ) -> None:
         """Writes colours of coarse levels to (possibly mapped) tensors; see `write_colors`."""
-        tables = [
-            self.transfer.table(
-                Sampling(smallest_spacing=min(spacing), step=side / 2, device=device)
-            )
-            for side in spacing
-        ]
+        sampling = Sampling(smallest_spacing=min(spacing), step=min(spacing) / 2, device=device)
+        tables = [self.transfer.table(replace(sampling, step=side / 2)) for side in spacing]
         one_mean = self.colors(spacing).width == self.numbers
         write_colors(field, tables, spacing, branching, out, progress, all_light=one_mean)
 
@@ -355,17 +348,13 @@ class Filtered(Shader):
     def unlit(self) -> Shader:
         if not isinstance(self.transfer, Lit):
             return super().unlit()
-        unlit = copy(self)
-        unlit.transfer = self.transfer.unlit()
-        return unlit
+        return self.changed(transfer=self.transfer.unlit())
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         if tree.made_of.get(str(self.other), self.made_of) != self.made_of:
-            raise ValueError(
-                f"{context}: the colours {self.other!r} were made of another function or "
-                "component, or it was edited: make them again (Filtered.of, Filtered.add_to, a new "
-                "producer)"
-            )
+            made = f"the colours {self.other!r} were made of another function or component"
+            hint = "make them again (Filtered.of, Filtered.add_to, a new producer)"
+            raise ValueError(f"{context}: {made}, or it was edited: {hint}")
         widths = channel_widths(self.numbers)
         check_width(f"{context}: filtered colours need", tree, self.other, *widths)
         arguments = super().shading(context, tree)

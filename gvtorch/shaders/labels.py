@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from copy import copy
 from typing import Any, ClassVar, Literal, Self, TypeVar, Unpack
 
 import numpy as np
@@ -39,11 +38,7 @@ class Labels(LitShader):
     Attributes may be edited, also in place: the next picture uses them.
 
     Attributes:
-        colors: By label, or in the order 0, 1, 2, ...; other labels get distinct colours.
-        opacity: Of all labels, or by label (1 for those left out), per reference length.
-        visible: The labels that are shown; None: all but 0, the background; "all": all.
-        reference: World units, or None for the smallest spacing.
-        lit: Whether they are lit.
+        colors, opacity, visible, reference, lit: As they were given.
     """
 
     kind = "Labels"
@@ -67,8 +62,8 @@ class Labels(LitShader):
             colors: By label, or in the order 0, 1, 2, ...; each is linear red, green, blue, or a
                 name or #RRGGBB in sRGB. An array (k, 3) of uint8 holds sRGB. Labels left out get
                 distinct colours.
-            opacity: Of all labels, or by label (1 for those left out), in [0, 1]; labels with
-                opacity 0 are treated as not present.
+            opacity: Of all labels, or by label (1 for those left out), in [0, 1], per reference
+                length; labels with opacity 0 are treated as not present.
             visible: The labels that are shown; None: all but 0, the background; "all": all.
             channel: Name of the channel of labels; None: that of the options.
             reference: World units for which opacity is given; None: the smallest spacing.
@@ -91,11 +86,7 @@ class Labels(LitShader):
     def __repr__(self) -> str:
         """Returns the arguments that differ from the defaults."""
         arguments = {"colors": self.colors, "visible": self.visible}
-        parts = [
-            f"{name}={check.as_text(value)}"
-            for name, value in arguments.items()
-            if value is not None
-        ]
+        parts = [f"{n}={check.as_text(v)}" for n, v in arguments.items() if v is not None]
         if isinstance(self.opacity, Mapping) or self.opacity < 1:
             parts.append(f"opacity={self.opacity}")
         return f"Labels({', '.join(parts + ['lit=False'] * (not self.lit))})"
@@ -118,14 +109,10 @@ class Labels(LitShader):
         return LabelNumbers(lit=float(self.lit))
 
     def unlit(self) -> Self:
-        unlit = super().unlit()
-        unlit.lit = True
-        return unlit
+        return super().unlit().changed(lit=True)
 
     def blocker(self) -> Labels:
-        blocker = copy(self)
-        blocker.lit = False  # normals would only cost time
-        return blocker
+        return self.changed(lit=False)  # normals would only cost time
 
     def table(self, sampling: Sampling) -> ColorTable:
         raise ValueError("Labels: which rows there are, the tree tells: table_of")
@@ -191,10 +178,8 @@ def label_rows(tree: N3Tree, channel: str) -> tuple[float, np.ndarray]:
         )
     low, high = value_range or (torch.iinfo(dtype).min, torch.iinfo(dtype).max)
     if high - low >= _MAX_TABLE_ROWS:
-        raise ValueError(
-            f"Labels: channel {channel!r} reaches from {low:g} to {high:g}, a table holds "
-            f"{_MAX_TABLE_ROWS} labels"
-        )
+        reach = f"reaches from {low:g} to {high:g}, a table holds {_MAX_TABLE_ROWS} labels"
+        raise ValueError(f"Labels: channel {channel!r} {reach}")
     return float(low), np.arange(int(low), int(high) + 1)
 
 
@@ -230,7 +215,7 @@ class _Appearance:
         )
 
     def colors_of(self, labels: np.ndarray) -> np.ndarray:
-        """Returns colours (m, 3) of labels (m,), which must be sorted."""
+        """Returns colours (m, 3) of sorted labels (m,)."""
         colors = distinct_colors(labels)
         listed = (labels >= 0) & (labels < len(self.listed_colors))
         colors[listed] = self.listed_colors[labels[listed]]
@@ -238,9 +223,7 @@ class _Appearance:
         return colors
 
     def opacities(self, labels: np.ndarray) -> np.ndarray:
-        """Returns opacities (m,) per reference length of labels (m,), which must be sorted; 0 for
-        those that are not visible.
-        """
+        """Returns opacities (m,) per reference length of sorted labels (m,); 0 if not visible."""
         opacities = np.full(len(labels), self.opacity)
         _assign_rows(opacities, labels, self.opacity_by_label)
         if self.visible is not None:

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass
-from math import inf
 from typing import Any, ClassVar, Self, TypedDict
 
 import numpy as np
@@ -18,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.checked import Check, Checked, class_name, whole_between
+from ..base.checked import Check, Checked, class_name, instance_of, whole_between
 from ..ops import ShadeArguments
 from ..ops.reference.shaders import shader_number
 from ..ops.shading import LightKind, Number, ShadeParameters, Triple
@@ -30,7 +28,7 @@ from .shader import Shader
 CONE_OF_DISC = 0.35
 
 
-def a_number(low: float = -inf, high: float = inf) -> Check:
+def a_number(low: float = -math.inf, high: float = math.inf) -> Check:
     """A check for a finite number in [low, high], or a tensor of one. The value of a CUDA tensor is
     not checked, since reading it would block.
     """
@@ -40,10 +38,8 @@ def a_number(low: float = -inf, high: float = inf) -> Check:
         check.no_gradient(context, name, value)
         if isinstance(value, Tensor):
             if value.numel() != 1:
-                got = check.describe(value)
-                raise ValueError(
-                    f"{context}: {name} must be a number or a tensor of one, got {got}"
-                )
+                got = f"got {check.describe(value)}"
+                raise ValueError(f"{context}: {name} must be a number or a tensor of one, {got}")
             if value.is_cuda:
                 return value
             number = value.item()
@@ -53,10 +49,8 @@ def a_number(low: float = -inf, high: float = inf) -> Check:
     return checked
 
 
-def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
-    """A check for three finite numbers in [low, high], or a tensor of them (see `a_number`); all
-    three may be 0 if `zero` is true.
-    """
+def a_triple(low: float = -math.inf, high: float = math.inf, zero: bool = True) -> Check:
+    """A check for three finite numbers in [low, high], as `a_number`; `zero`: they may all be 0."""
 
     def checked(owner: Any, name: str, value: Any) -> Any:
         context = class_name(owner)
@@ -65,9 +59,7 @@ def a_triple(low: float = -inf, high: float = inf, zero: bool = True) -> Check:
             if value.shape != (3,):
                 raise ValueError(f"{context}: {name} must be (3,), got {check.describe(value)}")
             return value
-        numbers = check.triple(context, name, value)
-        for number in numbers:
-            check.number(context, name, number, low=low, high=high)
+        numbers = check.triple(context, name, value, low=low, high=high)
         if not zero and not any(numbers):
             raise ValueError(f"{context}: {name} must not be zero")
         return numbers if isinstance(value, np.ndarray) else value
@@ -110,9 +102,8 @@ class DirectionalLight(Checked):
             growth: Number = 2 * CONE_OF_DISC * torch.tan(torch.deg2rad(self.angle) / 2)
         else:
             growth = 2 * CONE_OF_DISC * math.tan(math.radians(self.angle) / 2)
-        return ShadeParameters(
-            self.direction, LightKind.DIRECTIONAL, self.color, light_growth=growth
-        )
+        kind = LightKind.DIRECTIONAL
+        return ShadeParameters(self.direction, kind, self.color, light_growth=growth)
 
 
 @dataclass
@@ -170,7 +161,7 @@ class LitShader(Shader):
     shadows = False
     shadowed_kind: str | None = None
     checks: ClassVar[Mapping[str, Check]] = {
-        "light": lambda owner, name, value: check_light(f"{class_name(owner)}: {name}", value),
+        "light": instance_of(Headlight, DirectionalLight, PointLight),
         **dict.fromkeys(_MATERIAL[:4], a_number(low=0)),
         "octaves": whole_between(0, MOST_OCTAVES),
         "anisotropy": a_number(low=-0.95, high=0.95),
@@ -228,25 +219,10 @@ class LitShader(Shader):
         if self.shadowed_kind is None:
             raise ValueError(f"{context}: shadows per sample are for Lit and StoredColor")
         if isinstance(self.light, Headlight):
-            raise ValueError(
-                f"{context}: octaves of scattering need a sun or lamp, got a Headlight"
-            )
+            raise ValueError(f"{context}: octaves of scattering need a sun or lamp, no Headlight")
 
     def own_light(self) -> Light:
         return self.light
 
     def unlit(self) -> Self:
-        unlit = copy(self)
-        unlit.ambient, unlit.diffuse, unlit.specular = 1.0, 0.0, 0.0
-        unlit.shadows, unlit.octaves = False, 0
-        return unlit
-
-
-def check_light(label: str, value: Any) -> Light:
-    """Returns `value` if it is a light; raises ValueError otherwise."""
-    if not isinstance(value, Light):
-        raise ValueError(
-            f"{label} must be a Headlight, DirectionalLight or PointLight, "
-            f"got {type(value).__name__}"
-        )
-    return value
+        return self.changed(ambient=1.0, diffuse=0.0, specular=0.0, shadows=False, octaves=0)

@@ -1,7 +1,6 @@
 """`ModuleShader`: any `nn.Module` as a shader, for whatever torch can compute and differentiate.
 
-It is at least an order of magnitude slower than a shader in the kernel. tracing/tracer.py walks
-the rays for it.
+It is at least ten times slower than a shader in the kernel. tracing/tracer.py walks its rays.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ class ModuleShader(Shader, torch.nn.Module):
     Attributes:
         module: The module.
         channels: Names of the channels it reads; empty: that of `RenderOptions.channel`.
-        hidden_by: A transfer function; nodes in which it shows nothing are neither sampled nor
-            requested.
+        hidden_by: A transfer function; where it shows nothing, nodes are not sampled or requested.
         samples: About how many samples are shaded at once; None: 2^20 on the CPU and 2^24 on CUDA,
             where each batch waits for the device.
     """
@@ -64,9 +62,7 @@ class ModuleShader(Shader, torch.nn.Module):
         hidden_by: TransferFunction | None = None,
         samples: int | None = None,
     ) -> None:
-        """See the class; raises ValueError if the module is not callable or a number is out of its
-        range.
-        """
+        """See the class; raises ValueError if the module can't be called or a number is wrong."""
         super().__init__()
         self.module, self.hidden_by, self.samples = module, hidden_by, samples
         self.channels = () if channels is None else channels  # type: ignore[assignment]

@@ -55,8 +55,7 @@ def read_preset(path: str | Path, name: str | None) -> tuple[FunctionPoints, flo
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: The file holds something else, or has no such preset, or several and no name was
-            given.
+        ValueError: It holds something else, has no such preset, or several, and no name was given.
     """
     file = Path(path)
     if not file.is_file():
@@ -68,15 +67,14 @@ def read_preset(path: str | Path, name: str | None) -> tuple[FunctionPoints, flo
         if file.suffix == ".xml":
             nodes = ElementTree.parse(file).iter("VolumeProperty")
             presets = {node.get("name") or node.get("id") or "": node.attrib for node in nodes}
-            return _slicer_points(file, _choose(file, presets, name)), None, False
+            return _slicer_points(file, _choose(presets, name)), None, False
         content = check.json_file("transfer function file", file)
         if isinstance(content, dict) and "volumeProperties" in content:
             _refuse_name(name)
             return *_parse_vp_json(file, content), False
         items = content if isinstance(content, list) else [content]
-        if not all(
-            isinstance(i, dict) and i.keys() & {"RGBPoints", "IndexedColors"} for i in items
-        ):
+        kinds = {"RGBPoints", "IndexedColors"}
+        if not all(isinstance(item, dict) and item.keys() & kinds for item in items):
             raise ValueError(
                 'expected {"opacity": ..., "color": ...}, a list of ParaView presets '
                 '({"Name": ..., "RGBPoints": ...}) or "volumeProperties" of 3D Slicer'
@@ -84,21 +82,17 @@ def read_preset(path: str | Path, name: str | None) -> tuple[FunctionPoints, flo
         presets = {str(item.get("Name", index)): item for index, item in enumerate(items)}
         maps = {key: item for key, item in presets.items() if "RGBPoints" in item}
         if name in presets.keys() - maps or not maps:  # ParaView's lists may hold both kinds
-            raise ValueError(
-                "holds colours of categories (IndexedColors), which are not a function"
-            )
-        return _paraview_points(file, _choose(file, maps, name)), None, True
+            raise ValueError("holds colours of categories (IndexedColors), which are no function")
+        return _paraview_points(file, _choose(maps, name)), None, True
     except OverflowError:
         raise ValueError(f"{file}: holds a number that is too large") from None
     except (KeyError, TypeError, IndexError, ElementTree.ParseError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"{file}: not a file of the kind that its ending says: {error!r}"
-        ) from None
+        problem = f"not a file of the kind that its ending says: {error!r}"
+        raise ValueError(f"{file}: {problem}") from None
     except ValueError as error:
         message = one_line(error)
-        raise ValueError(
-            message if message.startswith(str(file)) else f"{file}: {message}"
-        ) from None
+        prefix = "" if message.startswith(str(file)) else f"{file}: "
+        raise ValueError(prefix + message) from None
 
 
 def _refuse_name(name: str | None) -> None:
@@ -106,7 +100,7 @@ def _refuse_name(name: str | None) -> None:
         raise ValueError(f"holds one preset, without a name: leave {name!r} out")
 
 
-def _choose(file: Path, presets: Mapping[str, Any], name: str | None) -> Any:
+def _choose(presets: Mapping[str, Any], name: str | None) -> Any:
     if name is None and len(presets) == 1:
         return next(iter(presets.values()))
     if name in presets:
@@ -142,20 +136,16 @@ def _parse_counted(text: str, width: int) -> np.ndarray:
 
 def _parse_vp_json(file: Path, content: Mapping[str, Any]) -> tuple[FunctionPoints, float | None]:
     component = content["volumeProperties"][0]["components"][0]
-    color_nodes = [
-        (p["x"], *p["color"], *_curve_shape(p)) for p in component["rgbTransferFunction"]["points"]
-    ]
+    colors = component["rgbTransferFunction"]["points"]
+    color_nodes = np.array([(p["x"], *p["color"], *_curve_shape(p)) for p in colors], float)
+    opacities = component["scalarOpacity"]["points"]
+    opacity_nodes = np.array([(p["x"], p["y"], *_curve_shape(p)) for p in opacities], float)
     gradient = [(p["x"], p["y"]) for p in component.get("gradientOpacity", {}).get("points", ())]
     if component.get("disableGradientOpacity"):
         gradient = []
-    opacity_nodes = [
-        (p["x"], p["y"], *_curve_shape(p)) for p in component["scalarOpacity"]["points"]
-    ]
     _warn_dropped(file, np.array(gradient or [(0, 1)]), shaded=bool(component.get("shade")))
-    reference = component.get("scalarOpacityUnitDistance")
-    return _gridded_points(
-        _opacities(np.array(opacity_nodes, float)), np.array(color_nodes, float)
-    ), reference
+    points = _gridded_points(_opacities(opacity_nodes), color_nodes)
+    return points, component.get("scalarOpacityUnitDistance")
 
 
 def _curve_shape(point: Mapping[str, float]) -> tuple[float, float]:
@@ -233,11 +223,8 @@ def _second_weight(position: np.ndarray, midpoint: float, sharpness: float) -> n
     sharpness 0 it is piecewise linear, at 1 a step; in between, positions are bent towards the
     midpoint, and go through a cubic whose end slopes fall with sharpness.
     """
-    s = np.where(
-        position < midpoint,
-        0.5 * position / midpoint,
-        0.5 + 0.5 * (position - midpoint) / (1 - midpoint),
-    )
+    below, above = 0.5 * position / midpoint, 0.5 + 0.5 * (position - midpoint) / (1 - midpoint)
+    s = np.where(position < midpoint, below, above)
     if sharpness < _LINEAR_BELOW:
         return s
     if sharpness > _STEP_ABOVE:
@@ -253,9 +240,7 @@ def _second_weight(position: np.ndarray, midpoint: float, sharpness: float) -> n
 def _gridded_points(
     opacity: np.ndarray, nodes: np.ndarray, space: str = "RGB", *, wrap: bool = False
 ) -> FunctionPoints:
-    """Returns opacity and linear colour on one grid. `nodes` are (value, sRGB), and may also have a
-    midpoint and a sharpness.
-    """
+    """Returns opacity and linear colour on one grid; nodes: value, sRGB (, midpoint, sharpness)."""
     if not len(nodes) or not len(opacity):
         raise ValueError("holds no points")
     nodes = nodes[np.argsort(nodes[:, 0], kind="stable")]
@@ -289,9 +274,8 @@ def _moved_to_grid(points: np.ndarray, low: float, step: float) -> Points:
     moved: list[tuple[float, ...]] = []
     last_cell = -1
     cells = np.rint((points[:, 0] - low) / step).astype(int)
-    for cell, run in itertools.groupby(
-        zip(cells, points[:, 1:].tolist(), strict=True), lambda p: p[0]
-    ):
+    placed = zip(cells, points[:, 1:].tolist(), strict=True)
+    for cell, run in itertools.groupby(placed, lambda point: point[0]):
         rows = [row for _, row in run]
         # Without a jump one row, so that values don't shift upwards.
         jump = rows[0] != rows[-1] and last_cell < cell
@@ -326,12 +310,9 @@ def _diverging(first: np.ndarray, last: np.ndarray, weights: np.ndarray) -> np.n
     """Returns (k, 3) Lab, interpolated by Moreland's method: through white if hues differ much."""
     ends = [_msh(first), _msh(last)]
     (m1, s1, h1), (m2, s2, h2) = ends
-    hue_difference = abs(h1 - h2)
+    hue_difference = min(abs(h1 - h2), 2 * math.pi - abs(h1 - h2))
     white = np.array([max(m1, m2, 88.0), 0.0, 0.0])
-    if (
-        min(s1, s2) > _UNSATURATED
-        and min(hue_difference, 2 * math.pi - hue_difference) > _WHITE_HUE_ANGLE
-    ):
+    if min(s1, s2) > _UNSATURATED and hue_difference > _WHITE_HUE_ANGLE:
         segments = [(ends[0], white, weights[weights <= 0.5] * 2)]
         segments += [(white, ends[1], weights[weights > 0.5] * 2 - 1)]
     else:

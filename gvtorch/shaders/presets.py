@@ -102,8 +102,7 @@ _POSITIONS = np.arange(COLORMAP_SAMPLES) / (COLORMAP_SAMPLES - 1)  # of these sa
 
 def preset_points(name: str) -> FunctionPoints:
     """Returns the points of a preset or of a colour map of matplotlib, which gets the opacity of
-    "gray". Values are in [0, 1], but in Hounsfield units for `CT_PRESETS`. Raises ValueError if the
-    name is unknown.
+    "gray". Values are in [0, 1], for `CT_PRESETS` in Hounsfield units. ValueError: unknown name.
     """
     presets = {**PRESETS, **CT_PRESETS}
     if check.instance("preset", "name", name, str) in presets:
@@ -112,10 +111,8 @@ def preset_points(name: str) -> FunctionPoints:
     map_name = name.removeprefix("matplotlib:")
     if map_name in maps:
         return _colormap(np.asarray(maps[map_name](_POSITIONS))[:, :3])
-    raise ValueError(
-        f"unknown preset {name!r}; known: {', '.join(sorted(presets))}, {hint}"
-        f"{did_you_mean(map_name, (*presets, *maps))}"
-    )
+    known = f"{', '.join(sorted(presets))}, {hint}{did_you_mean(map_name, (*presets, *maps))}"
+    raise ValueError(f"unknown preset {name!r}; known: {known}")
 
 
 def display_grays() -> FunctionPoints:
@@ -143,9 +140,8 @@ def convert_colors(name: str, colors: np.ndarray, **options: bool) -> np.ndarray
     import kornia.color
 
     planes = torch.from_numpy(np.array(colors, np.float64)).reshape(-1, 3).T[None, :, :, None]
-    return (
-        getattr(kornia.color, name)(planes, **options)[0, :, :, 0].T.reshape(colors.shape).numpy()
-    )
+    converted = getattr(kornia.color, name)(planes, **options)
+    return converted[0, :, :, 0].T.reshape(colors.shape).numpy()
 
 
 def linear_from_srgb(colors: np.ndarray) -> np.ndarray:

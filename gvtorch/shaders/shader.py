@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -104,8 +105,7 @@ class Shader(Checked):
         other_component: Index of the second channel's number that colours a surface.
         reads_coarse: Whether the second channel may be a coarse one, which only coarse bricks have.
         reads_labels: Whether it reads a channel of labels; other shaders would blend them.
-        whole_ray: Whether it must see each ray in one pass: options that cut rays into pieces
-            refuse it.
+        whole_ray: Whether it must see each ray in one pass: options that cut rays refuse it.
         uses_torch: Whether its colours are computed in torch, outside of the kernel. The host then
             waits for the device, so it can't be recorded as a CUDA graph.
     """
@@ -135,12 +135,15 @@ class Shader(Checked):
         """Returns the class name with its channels and parts."""
         names = ("channel", "normals", "transfer", "value", "which", "color", "other", "light")
         attributes = {name: getattr(self, name, None) for name in names}
-        parts = [
-            f"{name}={check.as_text(value)}"
-            for name, value in attributes.items()
-            if value is not None
-        ]
+        parts = [f"{n}={check.as_text(v)}" for n, v in attributes.items() if v is not None]
         return f"{type(self).__name__}({', '.join(parts)})"
+
+    def changed(self, **attributes: Any) -> Self:
+        """Returns a copy with other values of some attributes."""
+        other = copy(self)
+        for name, value in attributes.items():
+            setattr(other, name, value)
+        return other
 
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the colours as a table, the form in which the kernel reads them."""
@@ -197,9 +200,8 @@ class Shader(Checked):
             scale = 1 / number_of_one(normal_dtype)
             if normal_dtype in (torch.uint8, torch.uint16):
                 scale, offset = 2 * scale, -1.0
-        parameters = self.material()._replace(
-            own=self.own_numbers(tree), normal_scale=scale, normal_offset=offset
-        )
+        own, material = self.own_numbers(tree), self.material()
+        parameters = material._replace(own=own, normal_scale=scale, normal_offset=offset)
         return parameters.pack(dtype, tree.device)
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
@@ -218,15 +220,11 @@ class Shader(Checked):
             return None
         check_width(f"{context}: normals need", tree, self.normals, 3)
         if self.other is not None:
-            last = channels[self.other].width - 1
-            check.integer(
-                context, "component of the colour", self.other_component, low=0, high=last
-            )
+            name, last = "component of the colour", channels[self.other].width - 1
+            check.integer(context, name, self.other_component, low=0, high=last)
         bricks, constants = dict(tree.bricks.bricks), tree.nodes.constants
         if tree.depth == 0:  # the root is the finest level, so there are no coarse bricks
-            bricks |= {
-                name: bricks[name][:0] for name, channel in channels.items() if channel.coarse
-            }
+            bricks |= {n: bricks[n][:0] for n, channel in channels.items() if channel.coarse}
         return ShadeArguments(
             shader=0 if self.op else shader_number(self.kind),
             features=self.feature_count(tree),
@@ -247,9 +245,7 @@ class Shader(Checked):
 
     @property
     def projection(self) -> Literal["maximum", "minimum", "mean"] | None:
-        """Which value along a ray it shows. Results of a ray's pieces are joined by this rule;
-        None: they are composited.
-        """
+        """Which value along a ray it shows, of all pieces of a ray; None: they are composited."""
         return None
 
     def cut_surface(self) -> CutSurface | None:
@@ -313,10 +309,8 @@ def interval_levels(root_voxel: float, step: float) -> int:
 def check_shader(context: str, name: str, value: Any) -> None:
     """Raises ValueError unless a user's argument is a shader."""
     if not isinstance(value, Shader):
-        kind = type(value).__name__
-        raise ValueError(
-            f"{context}: {name} must be a TransferFunction or another shader, got {kind}"
-        )
+        wanted, kind = "a TransferFunction or another shader", type(value).__name__
+        raise ValueError(f"{context}: {name} must be {wanted}, got {kind}")
 
 
 def check_width(

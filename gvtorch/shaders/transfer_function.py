@@ -93,11 +93,9 @@ class TransferFunction(Shader):
         content = check.json_file("transfer function file", path)
         if not isinstance(content, dict) or "opacity" not in content:
             raise ValueError(f'{path}: expected an object with "opacity", "color" and "reference"')
-        unknown = sorted(set(content) - {"opacity", "color", "reference"})
-        if unknown:
-            raise ValueError(
-                f"{path}: unknown key {unknown[0]!r}; known: opacity, color, reference"
-            )
+        known = ("opacity", "color", "reference")
+        if unknown := sorted(set(content) - set(known)):
+            raise ValueError(f"{path}: unknown key {unknown[0]!r}; known: {', '.join(known)}")
         try:
             return cls.from_points(**content)
         except ValueError as error:
@@ -148,9 +146,7 @@ class TransferFunction(Shader):
         function = cls(*preset_points(name))
         if (low is None) != (high is None) or (low is None and name not in CT_PRESETS):
             raise ValueError(f"preset {name!r} is stretched over values: give low and high")
-        if low is None or high is None:
-            return function
-        return function.stretched(low, high)
+        return function if low is None or high is None else function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
         """Returns the function with its first corner point moved to `low` and its last to `high`. A
@@ -202,9 +198,7 @@ class TransferFunction(Shader):
         return not self.opacity[:, 1].any()
 
     def corners(self) -> tuple[float, float, np.ndarray]:
-        """Returns the first and last value of a table, and (k,) positions of the corner points
-        between them, 0 to 1.
-        """
+        """Returns a table's first and last value, and (k,) positions of corners between, 0 to 1."""
         values = np.unique(np.concatenate((self.opacity[:, 0], self.color[:, 0])))
         low, high = float(values[0]), float(values[-1])
         if high == low:
@@ -245,9 +239,7 @@ class TransferFunction(Shader):
         cells = _cell_count(positions)
         if cells is None:
             index = int(np.diff(positions).argmin())
-            first, second = (
-                low + position * (high - low) for position in positions[index : index + 2]
-            )
+            first, second = low + positions[index : index + 2] * (high - low)
             raise ValueError(
                 f"TransferFunction: values {first:g} and {second:g} are too close "
                 f"for a table of {_MAX_CELLS + 1} rows from {low:g} to {high:g}"
@@ -303,12 +295,11 @@ def _pairs(rows: np.ndarray, thickness: np.ndarray, color: np.ndarray, length: f
     diagonal = np.arange(count)
     alpha = alpha_over(length, rows[:, 3])
     out[diagonal, diagonal] = np.concatenate((rows[:, :3] * alpha[:, None], alpha[:, None]), 1)
+    opaque_color = np.concatenate((color, np.ones((len(color), 1))), 1)
     for distance in range(1, count):
         # Transmittance of each cell in between.
         transmittance = np.exp(-thickness * (length / distance))
-        emission = (
-            np.concatenate((color, np.ones((len(color), 1))), 1) * (1 - transmittance)[:, None]
-        )
+        emission = opaque_color * (1 - transmittance)[:, None]
         low = np.arange(count - distance)
         for backwards in (False, True):
             step = -1 if backwards else 1
@@ -326,9 +317,8 @@ def _cell_count(positions: np.ndarray) -> int | None:
     """Returns how many cells of [0, 1] suit corners at these positions; None: too dense."""
     exact_cells = _common_cells(positions, _MAX_CELLS, tolerance=1e-9)
     gap = float(np.diff(positions, append=2.0).min())
-    sampled_cells = max(
-        _MIN_SAMPLED_CELLS, 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9)))
-    )
+    sampled_cells = 2 ** math.ceil(math.log2(_CELLS_APART / max(gap, 1e-9)))
+    sampled_cells = max(_MIN_SAMPLED_CELLS, sampled_cells)
     if exact_cells and (exact_cells <= _MANY_CELLS or sampled_cells > _MAX_CELLS):
         return exact_cells * math.ceil(_MIN_CELLS / exact_cells)
     return sampled_cells if sampled_cells <= _MAX_CELLS else None
@@ -351,6 +341,10 @@ def _common_cells(
 
 def _checked_points(context: str, name: str, points: Points, width: int) -> np.ndarray:
     names = "(value, alpha)" if width == 2 else "(value, red, green, blue)"
+
+    def refusal(wanted: str) -> ValueError:
+        return ValueError(f"{context}: {name} {wanted}, got {check.quoted(points)}")
+
     try:
         rows = [list(point) for point in points]
         for number in (number for row in rows for number in row):
@@ -359,24 +353,16 @@ def _checked_points(context: str, name: str, points: Points, width: int) -> np.n
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{context}: {name} must be a list of points {names}") from None
     if array.ndim != 2 or array.shape[0] == 0 or array.shape[1] != width:
-        raise ValueError(
-            f"{context}: {name} must be a list of points {names}, got {check.quoted(points)}"
-        )
+        raise refusal(f"must be a list of points {names}")
     points = array.tolist()
     if not (np.abs(array) <= LARGEST).all():
-        raise ValueError(
-            f"{context}: {name} must be finite and at most {LARGEST:g}, got {check.quoted(points)}"
-        )
+        raise refusal(f"must be finite and at most {LARGEST:g}")
     steps = np.diff(array[:, 0])
     if (steps <= 0).any():
         index = int(np.argmax(steps <= 0))
-        raise ValueError(
-            f"{context}: {name} values must increase, "
-            f"got {array[index, 0]:g} before {array[index + 1, 0]:g} "
-            "(for a jump use two values close to each other)"
-        )
+        got = f"{array[index, 0]:g} before {array[index + 1, 0]:g}"
+        hint = "for a jump use two values close to each other"
+        raise ValueError(f"{context}: {name} values must increase, got {got} ({hint})")
     if (array[:, 1:] < 0).any() or (array[:, 1:] > 1).any():
-        raise ValueError(
-            f"{context}: {name} numbers must lie in [0, 1], got {check.quoted(points)}"
-        )
+        raise refusal("numbers must lie in [0, 1]")
     return array

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ from .composite import TraceRays, indices_if_few, reaches_depth, scatter_hits, t
 
 Face = tuple[float, ...]  # unit normal and offset (a, b, c, d): inside, a x + b y + c z + d >= 0
 Numbers = Sequence[Sequence[float]] | Tensor
+_Item = TypeVar("_Item")
+_Other = TypeVar("_Other")
 _MIN_CAP_ALPHA = 1e-4  # a cap is drawn where one interval behind the cut has more alpha than this
 
 
@@ -42,14 +44,12 @@ class Clip:
     cap_light: float = 0.5  # share of caps' light that comes from the eye; without `Lighting` only
 
     def __post_init__(self) -> None:
-        cap_opacity = check.number(
-            "Clip", "cap_opacity", self.cap_opacity, low=0, high=1, open_low=True
-        )
+        opacity, light = self.cap_opacity, self.cap_light
         vars(self).update(
             frame=Coordinates.of("Clip", self.frame),
             caps=check.instance("Clip", "caps", self.caps, bool),
-            cap_opacity=cap_opacity,
-            cap_light=check.number("Clip", "cap_light", self.cap_light, low=0, high=1),
+            cap_opacity=check.number("Clip", "cap_opacity", opacity, low=0, high=1, open_low=True),
+            cap_light=check.number("Clip", "cap_light", light, low=0, high=1),
         )
         _ = self._checked_faces
 
@@ -64,7 +64,7 @@ class Clip:
         return len(self.boxes) <= 1 and not len(self.without) and not self.caps
 
     @cached_property
-    def _checked_faces(self) -> Faces:
+    def _checked_faces(self) -> Faces[Face]:
         """The clip's faces, checked and in the units of `frame`."""
         for name in Faces._fields:
             if not _is_list(getattr(self, name)):
@@ -77,73 +77,46 @@ class Clip:
             return Faces(planes + boxes[0], [], without)
         return Faces(planes, boxes, without)
 
-    def faces(self, box: Tensor) -> Faces:
+    def faces(self, box: Tensor) -> Faces[Face]:
         """Returns the faces in world units, given the (2, 3) box of the scene."""
         if self.frame is Coordinates.WORLD:
             return self._checked_faces
         centre, side = ((box[0] + box[1]) / 2).tolist(), Coordinates.BOX.unit(box)
 
-        def to_world(faces: list[Face]) -> list[Face]:
-            return [(*n, d * side - _dot(n, centre)) for *n, d in faces]
+        def to_world(face: Face) -> Face:
+            *normal, offset = face
+            return (*normal, offset * side - _dot(normal, centre))
 
-        planes, boxes, without = self._checked_faces
-        return Faces(to_world(planes), [*map(to_world, boxes)], [*map(to_world, without)])
-
-
-class Faces(NamedTuple):
-    """The convex sets of a clip, as lists of faces whose normals point inwards."""
-
-    planes: list[Face]
-    boxes: list[list[Face]]
-    without: list[list[Face]]
+        return self._checked_faces.each(to_world)
 
 
-class _FaceCrossing(NamedTuple):
+class Faces(NamedTuple, Generic[_Item]):
+    """The convex sets of a clip: lists of faces, whose normals point inwards, or of their items."""
+
+    planes: list[_Item]
+    boxes: list[list[_Item]]
+    without: list[list[_Item]]
+
+    def each(self, convert: Callable[[_Item], _Other]) -> Faces[_Other]:
+        """Returns `convert` of each face."""
+        boxes, without = ([[*map(convert, faces)] for faces in sets] for sets in self[1:])
+        return Faces([*map(convert, self.planes)], boxes, without)
+
+
+class _Crossing(NamedTuple):
     """A face and rays, in float64. The face's numbers stay on the host, so nothing blocks."""
 
     normal: Sequence[float]
     height: Tensor  # (r,) signed distance of each ray's origin from the face, > 0 inside
     rate: Tensor  # (r,) growth of the height per unit distance along the ray
 
-
-class _FaceCrossings(NamedTuple):
-    """`Faces`, and where rays meet them: computed once for all pieces and caps."""
-
-    planes: list[_FaceCrossing]
-    boxes: list[list[_FaceCrossing]]
-    without: list[list[_FaceCrossing]]
-
-    @staticmethod
-    def of(faces: Faces, rays: Rays) -> _FaceCrossings:
-        """Computes where rays meet the faces."""
-        origin, direction = (
-            vectors.to(torch.float64).mT.contiguous() for vectors in (rays.origin, rays.direction)
-        )
-
-        def meet(face_list: list[Face]) -> list[_FaceCrossing]:
-            return [
-                _FaceCrossing(n, _dot(n, [*origin]) + d, _dot(n, [*direction]))
-                for *n, d in face_list
-            ]
-
-        return _FaceCrossings(
-            meet(faces.planes), [*map(meet, faces.boxes)], [*map(meet, faces.without)]
-        )
-
-    def select(self, index: Tensor) -> _FaceCrossings:
+    def select(self, index: Tensor) -> _Crossing:
         """Returns the same for some of the rays."""
+        return _Crossing(self.normal, self.height[index], self.rate[index])
 
-        def select_rays(crossings: list[_FaceCrossing]) -> list[_FaceCrossing]:
-            return [
-                _FaceCrossing(crossing.normal, crossing.height[index], crossing.rate[index])
-                for crossing in crossings
-            ]
 
-        return _FaceCrossings(
-            select_rays(self.planes),
-            [*map(select_rays, self.boxes)],
-            [*map(select_rays, self.without)],
-        )
+class _Crossings(Faces[_Crossing]):
+    """`Faces`, and where rays meet them: computed once for all pieces and caps."""
 
     def pieces(self, limits: Tensor) -> list[Tensor]:
         """Returns the kept pieces (r, 2) of the limits (r, 2), nearest first. There are as many as
@@ -211,7 +184,7 @@ class Clipped:
     together: Callable[[Iterable[Rays]], Hits] | None = None
 
     @cached_property
-    def _faces(self) -> Faces:
+    def _faces(self) -> Faces[Face]:
         return self.clip.faces(self.box)
 
     def __call__(self, rays: Rays) -> Hits:
@@ -224,11 +197,18 @@ class Clipped:
         cap = partial(self._cap, crossings, rays.range[:, 0]) if self.clip.caps else None
         return trace_pieces(self.trace, pieces, cap=cap)
 
-    def meet(self, rays: Rays) -> _FaceCrossings:
+    def meet(self, rays: Rays) -> _Crossings:
         """Computes where rays in world units meet the faces."""
-        return _FaceCrossings.of(self._faces, rays)
+        columns = (rays.origin, rays.direction)
+        origin, direction = (column.to(torch.float64).mT.contiguous() for column in columns)
 
-    def _cap(self, crossings: _FaceCrossings, range_start: Tensor, piece: Rays) -> Hits:
+        def cross(face: Face) -> _Crossing:
+            *n, offset = face
+            return _Crossing(n, _dot(n, [*origin]) + offset, _dot(n, [*direction]))
+
+        return _Crossings(*self._faces.each(cross))
+
+    def _cap(self, crossings: _Crossings, range_start: Tensor, piece: Rays) -> Hits:
         """Returns the caps of pieces that begin at a cut, not at `range_start` (r,). One interval
         behind the cut gives the colour, the features, and whether there is matter at all.
         """
@@ -236,14 +216,13 @@ class Clipped:
         end = torch.where(first > range_start, torch.minimum(first + self.step, last), first)
         index = indices_if_few(first < end)
         if index is not None:
-            caps = self._cap(crossings.select(index), range_start[index], piece[index])
-            return scatter_hits(piece, index, caps)
+            some = _Crossings(*crossings.each(lambda crossing: crossing.select(index)))
+            return scatter_hits(piece, index, self._cap(some, range_start[index], piece[index]))
         slab = (self.slab or self.trace)(replace(piece, range=torch.stack((first, end), 1)))
         before = piece.light()[:, 0].to(slab.color)  # transmittance before the cap
         absorbed = before - (1 - slab.alpha[:, 0])  # light absorbed by the slab
-        alpha = torch.where(absorbed > _MIN_CAP_ALPHA * before, self.clip.cap_opacity, 0.0).to(
-            before
-        )
+        has_cap = absorbed > _MIN_CAP_ALPHA * before
+        alpha = torch.where(has_cap, self.clip.cap_opacity, 0.0).to(before)
         facing, normal = crossings.facing(first)
         light = 1 - (0.0 if self.unlit else self.clip.cap_light) * (1 - facing)
         absorbed = torch.where(alpha > 0, absorbed, 1.0)
@@ -284,18 +263,16 @@ def _box(name: str, numbers: Any) -> list[Face]:
     if len(numbers) == 2:
         low, high = check.reals("Clip", name, numbers, (2, 3))
         if not bool((low < high).all()):
-            raise ValueError(
-                f"Clip: {name} must have its low corner below its high one on each axis, "
-                f"got {low.tolist()} and {high.tolist()}"
-            )
+            wanted = "have its low corner below its high one on each axis"
+            got = f"{low.tolist()} and {high.tolist()}"
+            raise ValueError(f"Clip: {name} must {wanted}, got {got}")
         axes, start, end = torch.eye(3, dtype=torch.float64, device="cpu"), low, high
     else:
         matrix = check.reals("Clip", name, numbers, (4, 4))
         volume, sides = torch.linalg.det(matrix).abs(), matrix[:3, :3].norm(dim=0)
         if matrix[3].tolist() != [0, 0, 0, 1] or not bool(volume > 1e-12 * sides.prod()):
-            raise ValueError(
-                f"Clip: {name} must be an affine matrix that can be inverted, got {matrix.tolist()}"
-            )
+            wanted = "an affine matrix that can be inverted"
+            raise ValueError(f"Clip: {name} must be {wanted}, got {matrix.tolist()}")
         inverse = torch.linalg.inv(matrix)
         length = inverse[:3, :3].norm(dim=1)
         axes = inverse[:3, :3] / length[:, None]
@@ -306,12 +283,8 @@ def _box(name: str, numbers: Any) -> list[Face]:
     return faces
 
 
-def _convex_span(
-    faces: Sequence[_FaceCrossing], first: Tensor, last: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Returns (r,) first and last distance, within [first, last], at which rays are inside all
-    faces; last < first where they miss.
-    """
+def _convex_span(faces: Sequence[_Crossing], first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns (r,) first and last distances in all faces and [first, last]; last < first: none."""
     for _, height, rate in faces:
         t = -height / rate
         first = torch.where(rate > 0, torch.maximum(first, t), first)

@@ -1,5 +1,4 @@
-"""Compositing of hits, of a ray's pieces or of another renderer's picture; and where rays enter and
-leave boxes.
+"""Compositing of hits: of a ray's pieces, of another renderer's picture; where rays meet boxes.
 
 Source: Porter, Duff, "Compositing digital images", 1984 (over, premultiplied).
 """
@@ -50,18 +49,16 @@ def over(front: Hits, back: Hits, *, dimmed: bool = False) -> Hits:
 
 def _nearer_label(front: Hits, back: Hits) -> Tensor | None:
     """Returns (r, 1) the label of whichever is hit first; None if neither has labels."""
-    label = front.label if front.label is not None else back.label
-    if label is None:
+    labels = columns_of((front, back), "label")
+    if labels is None:
         return None
-    no_label = torch.full_like(label, -1)
-    near, far = (no_label if hits.label is None else hits.label for hits in (front, back))
+    near, far = labels
     return torch.where(front.depth <= back.depth, near, far)
 
 
 def nothing_like(field: Tensor, rays: int) -> Tensor:
     """Returns the field (r, ...) of rays that hit nothing: zeros, or -1 for labels."""
-    shape = (rays, *field.shape[1:])
-    return field.new_full(shape, -1 if field.dtype == torch.int64 else 0)
+    return field.new_full((rays, *field.shape[1:]), -1 if field.dtype == torch.int64 else 0)
 
 
 def columns_of(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
@@ -72,10 +69,14 @@ def columns_of(hits: Sequence[Hits], name: str) -> list[Tensor] | None:
         return None
     if len({field.shape[1:] for field in present}) > 1:
         raise ValueError("render: all trees must give the same number of features")
-    return [
-        nothing_like(present[0], len(tree_hits.alpha)) if field is None else field
-        for tree_hits, field in zip(hits, fields, strict=True)
-    ]
+    pairs = zip(hits, fields, strict=True)
+    return [nothing_like(present[0], len(h.alpha)) if f is None else f for h, f in pairs]
+
+
+def merged(hits: Sequence[Hits], merge: Callable[[list[Tensor]], Tensor]) -> Hits:
+    """Returns hits of which each field is `merge` of its columns in all `hits`: `columns_of`."""
+    columns = {name: columns_of(hits, name) for name in vars(hits[0])}
+    return Hits(**{name: merge(parts) for name, parts in columns.items() if parts is not None})
 
 
 def join_hits(parts: Sequence[Hits], indices: Sequence[Tensor]) -> Hits:
@@ -83,11 +84,7 @@ def join_hits(parts: Sequence[Hits], indices: Sequence[Tensor]) -> Hits:
     if len(parts) == 1:
         return parts[0]
     order = torch.cat(list(indices)).argsort()
-    fields = {}
-    for name in vars(parts[0]):
-        if (columns := columns_of(parts, name)) is not None:
-            fields[name] = torch.cat(columns)[order]
-    return Hits(**fields)
+    return merged(parts, lambda columns: torch.cat(columns)[order])
 
 
 def behind(rays: Rays, front: Hits) -> Rays:
@@ -131,9 +128,8 @@ def scatter_hits(rays: Rays, index: Tensor, hits: Hits) -> Hits:
 
 def trace_pieces(trace: TraceRays, pieces: Iterable[Rays], *, cap: TraceRays | None = None) -> Hits:
     """Traces pieces of the same rays, nearest first. The result is that of tracing each ray in one
-    pass: a ray that has ended takes no more samples, and its depth is found in the piece that
-    contains it.
-    `cap` traces the cap in front of each piece.
+    pass: one that has ended takes no more samples, and its depth is found in the piece that
+    contains it. `cap` traces the cap in front of each piece.
     """
 
     def trace_open(rays: Rays) -> Hits:

@@ -1,6 +1,4 @@
-"""`cost`: images of what each ray of a picture cost and sampled (after Crassin, PhD thesis
-2011, chapter 6).
-"""
+"""`cost`: what each ray of a picture cost and sampled (Crassin, PhD thesis 2011, chapter 6)."""
 
 from __future__ import annotations
 
@@ -136,10 +134,8 @@ def cost(
     numbered = replace(counted, trace=lambda rays: counted.trace(counter.begin(rays)))
     view = View.of(camera, [numbered], chosen)
     with using("cost", [tree]):
-        columns = [
-            (hits.samples, counter.take_nodes(), *_means(hits))
-            for _, hits in view.blocks(_RAYS_PER_BLOCK, progress)
-        ]
+        blocks = view.blocks(_RAYS_PER_BLOCK, progress)
+        columns = [(hits.samples, counter.take_nodes(), *_means(hits)) for _, hits in blocks]
     joined = [torch.cat(parts) for parts in zip(*columns, strict=True)]
     stats = tree_stats([tree], chosen, joined[0])
     stats.milliseconds = 1e3 * (time.perf_counter() - start)
@@ -151,10 +147,8 @@ def _means(hits: Hits) -> tuple[Tensor, ...]:
     """Returns (r,) lod, age and fill from a counter's sums."""
     assert hits.features is not None
     seen, lod, bricks, age, fill = hits.features.unbind(1)
-    return tuple(
-        torch.where(weight > 0, total / weight, torch.nan)
-        for total, weight in ((lod, seen), (age, bricks), (fill, bricks))
-    )
+    pairs = (lod, seen), (age, bricks), (fill, bricks)
+    return tuple(torch.where(weight > 0, total / weight, torch.nan) for total, weight in pairs)
 
 
 class _Counter(Tracer):
@@ -194,9 +188,7 @@ class _Counter(Tracer):
         return replace(hits, features=sums)
 
     def shade(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Returns (k, 5) of samples: 1, the node's depth, whether it has a brick, the brick's age
-        and fill; and (k,) alpha.
-        """
+        """Returns (k, 5) of samples, which `__call__` sums, and (k,) alpha."""
         values = batch.values()[:, self.component, None]
         _, alpha = self.module(values, values, values, batch.lengths)  # it reads no positions
         slot = batch.segments.brick[batch.segment, 0].to(torch.int64)
@@ -205,10 +197,8 @@ class _Counter(Tracer):
             age = fill = torch.zeros_like(alpha[:, 0])
         else:
             self._fill(slot[has_brick & (alpha[:, 0] > 0)])
-            age, fill = (
-                self.tree.frame - self.tree.bricks.born_b[valid_slot],
-                self.fill_b[valid_slot],
-            )
+            age = self.tree.frame - self.tree.bricks.born_b[valid_slot]
+            fill = self.fill_b[valid_slot]
         depth = batch.segments.depth[batch.segment, 0]
         columns = (torch.ones_like(depth), depth, has_brick, age * has_brick, fill * has_brick)
         return torch.stack([c.to(alpha.dtype) for c in columns], 1), alpha[:, 0]

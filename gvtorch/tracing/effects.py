@@ -1,10 +1,8 @@
-"""`TreeTrace`: a tree's tracer, wrapped in the effects of the options: depth of field, clip,
-lighting.
-"""
+"""`TreeTrace`: a tree's tracer, wrapped in the options' effects: depth of field, clip, lighting."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -46,10 +44,9 @@ def box_spans(trees: Sequence[TreeTrace], rays: Rays) -> Tensor:
     spans = []
     for tree in trees:
         tree_rays = tree.tracer.to_tree(rays)
-        low, high = pack(
-            (tree.tracer.tree.box,), tree_rays.origin.dtype, tree_rays.origin.device
-        ).view(2, 3)
-        first, last = box_span(low, high, tree_rays.origin, tree_rays.direction)
+        origin = tree_rays.origin
+        low, high = pack((tree.tracer.tree.box,), origin.dtype, origin.device).view(2, 3)
+        first, last = box_span(low, high, origin, tree_rays.direction)
         near, far = rays.range.to(first).unbind(1)
         spans.append(torch.stack((torch.maximum(first, near), torch.minimum(last, far)), 1))
     return torch.stack(spans)
@@ -119,9 +116,7 @@ def _clipped(
     if options.clip is None:
         return trace
     surface = tracer.shader.cut_surface() if options.clip.caps else None
-    together: Callable[[Iterable[Rays]], Hits] | None = None
-    if tracer.shader.projection is not None:
-        together = partial(_project_pieces, tracer)
+    together = None if tracer.shader.projection is None else partial(_project_pieces, tracer)
     return Clipped(
         trace,
         options.clip,
@@ -183,11 +178,9 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
     """
     rays, kind = list(pieces), tracer.shader.projection
     hits = [tracer(piece) for piece in rays]
-    depths = torch.stack([piece_hits.depth for piece_hits in hits])  # (pieces, r, 1)
+    depths = torch.stack([h.depth for h in hits])  # (pieces, r, 1)
     is_hit = depths < torch.inf
-    values = torch.stack(
-        [piece_hits.features for piece_hits in hits if piece_hits.features is not None]
-    )
+    values = torch.stack([h.features for h in hits if h.features is not None])
     if kind == "mean":
         lengths = torch.stack([_length_inside(tracer, piece) for piece in rays])
         lengths = torch.where(is_hit, lengths.to(values)[..., None], 0)
@@ -204,8 +197,8 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
         color=torch.where(seen, light * _table_color(tracer, value), 0),
         alpha=torch.where(seen, 1, 1 - light),
         depth=depth,
-        samples=torch.stack([piece_hits.samples for piece_hits in hits]).sum(0, dtype=torch.int32),
-        missed=torch.stack([piece_hits.missed for piece_hits in hits]).any(0),
+        samples=torch.stack([h.samples for h in hits]).sum(0, dtype=torch.int32),
+        missed=torch.stack([h.missed for h in hits]).any(0),
         normal=hits[0].normal,
         features=value,
     )

@@ -28,8 +28,7 @@ class Layer:
     counts as +inf.
 
     Attributes:
-        color: (h, w, 3) or, for a batch of cameras, (n, h, w, 3); linear RGB, premultiplied by
-            alpha.
+        color: (h, w, 3) or, for a batch of cameras, (n, h, w, 3); linear RGB, premultiplied.
         depth: (h, w, 1) or (n, h, w, 1) distance along the ray in world units, +inf where there is
             nothing; `gv.opengl.ray_distance` makes it from a depth buffer.
         alpha: As depth, 0 (nothing there) to 1; opaque if left out.
@@ -45,10 +44,8 @@ class Layer:
                 continue
             check.images("Layer", name, image, 3 if name == "color" else 1)
             if image.shape[:-1] != self.color.shape[:-1]:
-                raise ValueError(
-                    f"Layer: {name} must have the pixels of color, {check.describe(self.color)}, "
-                    f"got {check.describe(image)}"
-                )
+                color, got = check.describe(self.color), check.describe(image)
+                raise ValueError(f"Layer: {name} must have the pixels of color, {color}, got {got}")
         if not bool(torch.isfinite(self.color).all()):
             raise ValueError("Layer: color must be finite, got NaN or infinity")
         if not bool((self.depth >= 0).all()):
@@ -66,8 +63,7 @@ class Layer:
         return [(name, image) for name, image in vars(self).items() if image is not None]
 
     def cut(self, context: str, camera: Camera) -> Layer:
-        """Returns the part of the layer that a camera sees: if the camera is a strip of rows, views
-        of these rows.
+        """Returns the part of the layer that a camera sees: of a strip of rows, views of these.
 
         Raises:
             ValueError: The layer's size is not that of the camera's whole pictures.
@@ -78,10 +74,8 @@ class Layer:
         if got == (*count, camera.height, camera.width):
             return self
         if got != wanted:
-            raise ValueError(
-                f"{context}: layer must have the camera's {wanted} pixels (rows, columns), "
-                f"got {got}"
-            )
+            pixels = f"{wanted} pixels (rows, columns)"
+            raise ValueError(f"{context}: layer must have the camera's {pixels}, got {got}")
         strip = copy.copy(self)  # checked already
         for name, image in self._images():
             object.__setattr__(strip, name, image[..., top : top + camera.height, :, :])
@@ -91,10 +85,8 @@ class Layer:
         """Raises ValueError unless all tensors are on the device."""
         for _, image in self._images():
             if image.device != device:
-                raise ValueError(
-                    f"capture: layer must lie on {device}, where the graph reads it, "
-                    f"got {image.device}"
-                )
+                place = f"{device}, where the graph reads it"
+                raise ValueError(f"capture: layer must lie on {place}, got {image.device}")
 
     def distance(self, device: torch.device) -> Tensor:
         """Returns (p, 1) the distance of the layer at every pixel, +inf where it shows nothing."""

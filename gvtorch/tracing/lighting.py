@@ -33,7 +33,6 @@ from ..shaders.lights import (
     Light,
     PointLight,
     a_triple,
-    check_light,
 )
 from .composite import TraceRays, behind, indices_if_few, over
 from .thin_lens import ThinLens
@@ -77,7 +76,8 @@ class Lighting:
             kind = type(self.lights).__name__
             raise ValueError(f"{context}: lights must be a sequence of lights, got {kind}")
         for number, light in enumerate(self.lights or ()):
-            check_light(f"{context}: lights[{number}]", light)
+            name = f"lights[{number}]"
+            check.instance(context, name, light, Headlight, DirectionalLight, PointLight)
         reach = self.reach
         if reach is not None:
             reach = check.number(context, "reach", reach, low=0, open_low=True)
@@ -120,9 +120,7 @@ class _Points:
 
     def select(self, index: Tensor) -> _Points:
         """Returns some of the points, with a new tally."""
-        columns = {
-            name: column[index] for name, column in vars(self).items() if isinstance(column, Tensor)
-        }
+        columns = {n: c[index] for n, c in vars(self).items() if isinstance(c, Tensor)}
         counters = (self.tally.samples, self.tally.missed)
         tally = _Tally(*(count.new_zeros(len(index)) for count in counters))
         return replace(self, **columns, row_width=0, tally=tally)
@@ -222,13 +220,10 @@ class Lighted:
             light_size = getattr(light, "angle", getattr(light, "radius", 0.0))
             # A tensor is not read: that would block.
             count = cones if isinstance(light_size, Tensor) or light_size else 1
-            light_color = (
-                self._visible_fraction(light, count, points, beam, facing > 0)[:, None] * color
-            )
-            diffuse, highlights = (
-                diffuse + facing[:, None] * light_color,
-                highlights + highlight[:, None] * light_color,
-            )
+            fraction = self._visible_fraction(light, count, points, beam, facing > 0)
+            light_color = fraction[:, None] * color
+            diffuse = diffuse + facing[:, None] * light_color
+            highlights = highlights + highlight[:, None] * light_color
         return diffuse, highlights
 
     def _visible_fraction(
@@ -253,9 +248,8 @@ class Lighted:
         blocked = torch.zeros_like(distance)
         for x, y in _disc_points(cones):
             cone_direction = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
-            hits = points.tally(
-                self.blocker(self._cones_from(points, cone_direction, growth, start, end))
-            )
+            cone_rays = self._cones_from(points, cone_direction, growth, start, end)
+            hits = points.tally(self.blocker(cone_rays))
             blocked = blocked + hits.alpha[:, 0] / cones
         return 1 - self.lighting.shadows * blocked
 
@@ -288,10 +282,8 @@ class Lighted:
         for direction in _hemisphere_directions(points.normal, rays.sample, lighting.cones):
             # Cones stay above the surface.
             growth = dot(direction, points.normal).clamp(0, _MAX_CONE_GROWTH)
-            near_cones, far_cones = (
-                self._cones_from(lifted, direction, growth, *span)
-                for span in ((start, middle), (middle, end))
-            )
+            near_cones = self._cones_from(lifted, direction, growth, start, middle)
+            far_cones = self._cones_from(lifted, direction, growth, middle, end)
             front = trace(near_cones)
             hits = points.tally(over(front, trace(behind(far_cones, front)), dimmed=True))
             absorbed = (front.alpha + hits.alpha).to(unblocked) / 2

@@ -78,10 +78,8 @@ class RenderOptions:
         )
         check.one_of(context, "lod", self.lod, ("auto", "finest"))
         if self.depth_alpha >= self.stop_alpha:
-            raise ValueError(
-                f"{context}: depth_alpha must be below stop_alpha, "
-                f"got {self.depth_alpha} and {self.stop_alpha}"
-            )
+            got = f"{self.depth_alpha} and {self.stop_alpha}"
+            raise ValueError(f"{context}: depth_alpha must be below stop_alpha, got {got}")
         check.instance(context, "backend", self.backend, str)
         kinds = dict(channel=str, clip=Clip, layer=Layer, lens=ThinLens, lighting=Lighting)
         for name, kind in kinds.items():

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from .. import ops
 from ..base.records import Hits, Rays
-from .composite import TraceRays, columns_of, join_hits, nothing_like, over, reaches_depth
+from .composite import TraceRays, join_hits, merged, nothing_like, over, reaches_depth
 from .effects import TreeTrace, box_spans
 from .tracer import Batch
 
@@ -39,11 +39,8 @@ _JOINS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 
 def mix_by_sample(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Composites trees by sample, a block of rays at a time."""
-    size = _RAYS_PER_BLOCK[rays.origin.device.type]
-    blocks = [
-        torch.arange(start, min(start + size, len(rays.origin)), device=rays.origin.device)
-        for start in range(0, len(rays.origin), size)
-    ]
+    index = torch.arange(len(rays.origin), device=rays.origin.device)
+    blocks = index.split(_RAYS_PER_BLOCK[index.device.type])
     return join_hits([_trace_block(trees, rays[block]) for block in blocks], blocks)
 
 
@@ -53,9 +50,8 @@ def _trace_block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     if not surfaces:
         return _trace_media(trees, rays)
     media = [tree for tree in trees if tree not in surfaces]
-    back = reduce(
-        _nearer_hits, [tree.trace(replace(rays, transmittance=None)) for tree in surfaces]
-    )
+    lit_rays = replace(rays, transmittance=None)
+    back = reduce(_nearer_hits, [tree.trace(lit_rays) for tree in surfaces])
     depth = back.depth.to(rays.range.dtype)
     front_range = torch.cat((rays.range[:, :1], torch.minimum(rays.range[:, 1:], depth)), 1)
     front = _no_hits(rays, trees[0].tracer.dtype)
@@ -68,14 +64,14 @@ def _trace_block(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
 
 def _nearer_hits(hits_a: Hits, hits_b: Hits) -> Hits:
     """Returns the nearer of two hits of each ray."""
-    a_is_nearer, fields = (hits_a.depth <= hits_b.depth)[:, 0], {}
-    for name in vars(hits_a):
-        pair = columns_of((hits_a, hits_b), name)
-        if pair is not None:
-            a, b = pair
-            fields[name] = torch.where(a_is_nearer if a.dim() == 1 else a_is_nearer[:, None], a, b)
-    fields |= {"samples": hits_a.samples + hits_b.samples, "missed": hits_a.missed | hits_b.missed}
-    return Hits(**fields)
+    a_is_nearer = hits_a.depth <= hits_b.depth
+
+    def nearer(columns: list[Tensor]) -> Tensor:
+        a, b = columns
+        return torch.where(a_is_nearer if a.dim() > 1 else a_is_nearer[:, 0], a, b)
+
+    samples, missed = hits_a.samples + hits_b.samples, hits_a.missed | hits_b.missed
+    return replace(merged((hits_a, hits_b), nearer), samples=samples, missed=missed)
 
 
 def _trace_media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
@@ -93,14 +89,10 @@ def _trace_media(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
         several = inside.sum(0) > 1
         if not bool(several.any()):
             continue
-        for part in range(_PARTS_PER_STRETCH):
-            low, high = (
-                near + (far - near) * (index / _PARTS_PER_STRETCH) for index in (part, part + 1)
-            )
-            high = far if part == _PARTS_PER_STRETCH - 1 else high
-            hits = _add_stretch(
-                hits, rays, several, (low, high), stop, lambda piece: _trace_mixed(trees, piece)
-            )
+        shares = [part / _PARTS_PER_STRETCH for part in range(_PARTS_PER_STRETCH)]
+        part_ends = [near + (far - near) * share for share in shares]
+        for part in pairwise([*part_ends, far]):
+            hits = _add_stretch(hits, rays, several, part, stop, partial(_trace_mixed, trees))
     return hits if hits.normal is None else replace(hits, normal=_unit_vectors(hits.normal))
 
 
@@ -128,12 +120,9 @@ def _add_stretch(
     for name, values in fields_behind.items():
         if values is None:
             continue
-        values_before = fields[name]
-        if values_before is None:
-            values_before = nothing_like(values, len(mask))
-        fields[name] = values_before.index_copy(
-            0, index, _JOINS.get(name, torch.add)(values_before[index], values)
-        )
+        before = nothing_like(values, len(mask)) if fields[name] is None else fields[name]
+        joined = _JOINS.get(name, torch.add)(before[index], values)
+        fields[name] = before.index_copy(0, index, joined)
     return Hits(**fields)
 
 
@@ -154,13 +143,18 @@ def _trace_mixed(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     depth, label = _locate_hits(trees, rays, pieces, hit, clear_before[hit], within)
     samples = torch.zeros(len(clear), dtype=torch.int32, device=clear.device)
     samples.index_add_(0, pieces.ray, torch.where(clear_before > 0, piece_sums.samples, 0))
-    return piece_sums.hits(sums, clear_after, depth, label, samples, pieces.missed)
+    return Hits(
+        **piece_sums.fields(sums),
+        alpha=(1 - clear_after)[:, None].to(tracer.dtype),
+        depth=depth[:, None].to(tracer.dtype),
+        label=label,
+        samples=samples,
+        missed=pieces.missed,
+    )
 
 
 def _trace_pieces(trees: Sequence[TreeTrace], rays: Rays, pieces: _Pieces) -> _PieceSums:
-    """Traces each tree in the pieces where it is sampled; also marks the rays that missed something
-    there.
-    """
+    """Traces each tree in the pieces where it is sampled; marks the rays that missed something."""
     piece_sums = _PieceSums(pieces, trees[0].tracer.dtype)
     for tree, covered in zip(trees, pieces.covered, strict=True):
         piece_index = covered.nonzero()[:, 0]
@@ -246,29 +240,14 @@ class _PieceSums:
         columns = [*self.sums.values()] or [self.extinction[:, :0]]
         return torch.cat(columns, 1) / self.extinction.clamp(min=1e-300)
 
-    def hits(
-        self,
-        sums: Tensor,  # (r, c) of `features` along each ray
-        clear: Tensor,  # (r,) transmittance left
-        depth: Tensor,  # (r,)
-        label: Tensor | None,
-        samples: Tensor,
-        missed: Tensor,
-    ) -> Hits:
-        """Returns the hits of rays; label, samples and missed are fields of `Hits`."""
+    def fields(self, sums: Tensor) -> dict[str, Tensor]:
+        """Returns colours, normals and features of rays: sums (r, c) of `features` along each."""
         widths = [columns.shape[1] for columns in self.sums.values()]
         fields = dict(zip(self.sums, sums.to(self.dtype).split(widths, 1), strict=True))
-        color = fields.get("color", sums.new_zeros((len(sums), 3), dtype=self.dtype))
-        return Hits(
-            color=color,
-            alpha=(1 - clear)[:, None].to(self.dtype),
-            depth=depth[:, None].to(self.dtype),
-            normal=_unit_vectors(fields["normal"]) if "normal" in fields else None,
-            features=fields.get("features"),
-            label=label,
-            samples=samples,
-            missed=missed,
-        )
+        fields.setdefault("color", sums.new_zeros((len(sums), 3), dtype=self.dtype))
+        if "normal" in fields:
+            fields["normal"] = _unit_vectors(fields["normal"])
+        return fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,10 +292,9 @@ def _cut_into_pieces(trees: Sequence[TreeTrace], rays: Rays) -> _Pieces:
         for end, step in zip(ends, (1, -1), strict=True):
             ray_parts.append(batch.ray)
             distance_parts.append(end)
-            change_parts.append(
-                torch.zeros(len(end), len(trees), dtype=torch.int32, device=end.device)
-            )
-            change_parts[-1][:, tree_index] = step
+            change = torch.zeros(len(end), len(trees), dtype=torch.int32, device=end.device)
+            change[:, tree_index] = step
+            change_parts.append(change)
     ray_k, distance_k = torch.cat(ray_parts), torch.cat(distance_parts)
     order = distance_k.argsort(stable=True)
     order = order[ray_k[order].argsort(stable=True)]
@@ -352,11 +330,8 @@ def _no_hits(rays: Rays, dtype: torch.dtype, trees: Sequence[TreeTrace] = ()) ->
     """Returns hits of rays that have met nothing yet, with all fields that the trees give."""
     column = torch.zeros(len(rays.origin), 1, dtype=dtype, device=rays.origin.device)
     color = column.expand(-1, 3).contiguous()
-    shaded = [
-        (tree.tracer.label_names, shading)
-        for tree in trees
-        if (shading := tree.tracer.shading) is not None
-    ]
+    tracers = [tree.tracer for tree in trees]
+    shaded = [(t.label_names, t.shading) for t in tracers if t.shading is not None]
     # The kernel returns a label as its only feature, which the tracer turns into `label`.
     widths = [shading.features if names is None else 0 for names, shading in shaded]
     labeled = any(names is not None for names, _ in shaded)

@@ -1,6 +1,4 @@
-"""`View`: traces all pixels of a camera, and makes a picture of their hits; `render` and `trace`
-use it for resident trees.
-"""
+"""`View`: traces a camera's pixels and makes their picture; `render`, `trace`: resident trees."""
 
 from __future__ import annotations
 
@@ -64,8 +62,7 @@ def render(
             call; for several pictures make the tree once.
         camera: One camera or a batch; an orbit camera is placed around the scene's box. Or rays in
             world units, which make a picture as wide as `Rays.width`, or of one row.
-        shader: The transfer function, in data units, or another shader; or one for each tree by
-            name.
+        shader: The transfer function, in data units, or another shader; or several by tree name.
         progress: Receives the number of finished rows.
         **options: Fields of `RenderOptions`.
 
@@ -252,9 +249,8 @@ class View:
         """
         device = self.numbers.device
         alone = len(self.trees) == 1 and isinstance(self.trees[0].trace, Tracer)
-        at_once = device.type == "cuda" or (
-            alone and len(self.camera) > 1 and progress is no_progress
-        )
+        silent_batch = alone and len(self.camera) > 1 and progress is no_progress
+        at_once = device.type == "cuda" or silent_batch
         block = _RAYS_PER_BLOCK if at_once else _RAYS_PER_REPORT
         size = self.ray_count * (8 * self.options.dtype.itemsize + 5)  # the colour twice
         check.memory("render", f"a picture of {self.ray_count} pixels", size, device)

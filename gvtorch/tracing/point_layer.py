@@ -43,15 +43,12 @@ def point_layer(
         cone_scale: The picture's `cone_scale`.
 
     Raises:
-        ValueError: The producer draws no points or has other values, or the camera is of another
-            kind.
+        ValueError: The producer draws no points or has other values, or the camera is no pinhole.
     """
     context = "point_layer"
     check.instance(context, "producer", producer, PointProducer)
     if not producer.drawn or producer.points.width != 4:
-        raise ValueError(
-            f"{context}: needs PointProducer(drawn=True) of 4 values, as of Points.lit"
-        )
+        raise ValueError(f"{context}: needs PointProducer(drawn=True) of 4 values (Points.lit)")
     check.instance(context, "camera", camera, Camera)
     if camera.model != "pinhole" or camera.batched:
         raise ValueError(f"{context}: the camera must be one pinhole camera, got {camera!r}")
@@ -67,17 +64,14 @@ def point_layer(
     finest = float(grid.spacing_3.max())
     growth = cone_scale / min(K[0, 0], K[1, 1])
     reach = finest * grid.branching / growth
-    voxel_light = float(np.prod(grid.spacing_3)) / (
-        float(grid.spacing_3.min()) if reference is None else reference
-    )
+    length = float(grid.spacing_3.min()) if reference is None else reference
+    voxel_light = float(np.prod(grid.spacing_3)) / length
     height, width = placed.height, placed.width
     total = np.zeros((height * width, 5))  # of a pixel: light, opacity, light * distance
     near_points = narrow_near(points, eye, reach + grid.branching * 2 * finest)
     for start in range(0, len(near_points), _POINTS_PER_BLOCK):
-        rows = {
-            name: column[near_points[start : start + _POINTS_PER_BLOCK]]
-            for name, column in points.points[0].rows.items()
-        }
+        index = near_points[start : start + _POINTS_PER_BLOCK]
+        rows = {name: column[index] for name, column in points.points[0].rows.items()}
         position = rows["position"].astype(np.float64)
         xyz = position @ view[:3, :3].T + view[:3, 3]
         coarse = grid.spacing_3 * grid.branching
@@ -100,13 +94,10 @@ def _layer(total: np.ndarray, shape: tuple[int, int]) -> Layer:
     light = total[:, :3]
     bright = light.sum(1)
     shown = (bright > 0) | (total[:, 3] > 0)
-    mean = np.divide(
-        total[:, 4], bright + total[:, 3], where=shown, out=np.full(len(bright), np.inf)
-    )
+    nowhere = np.full(len(bright), np.inf)
+    mean = np.divide(total[:, 4], bright + total[:, 3], where=shown, out=nowhere)
     alpha = np.where(shown, np.clip(1 - np.exp(-total[:, 3]), _MIN_ALPHA, 1), 0)
-    images = (
-        torch.from_numpy(image).to(torch.float32).view(*shape, -1) for image in (light, mean, alpha)
-    )
+    images = (torch.from_numpy(image).float().view(*shape, -1) for image in (light, mean, alpha))
     return Layer(*images)
 
 

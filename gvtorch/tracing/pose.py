@@ -37,14 +37,11 @@ class Pose:
             return matrix
         numbers = check.reals(context, name, matrix, (4, 4))
         turn = numbers[:3, :3]
-        deviation = float(
-            (turn.T @ turn - torch.eye(3, dtype=torch.float64, device="cpu")).abs().max()
-        )
+        identity = torch.eye(3, dtype=torch.float64, device="cpu")
+        deviation = float((turn.T @ turn - identity).abs().max())
         if numbers[3].tolist() != [0, 0, 0, 1] or deviation > _ROUNDING:
-            raise ValueError(
-                f"{context}: {name} must turn and shift, and neither stretch nor shear, "
-                f"got {numbers.tolist()}"
-            )
+            wanted = "turn and shift, and neither stretch nor shear"
+            raise ValueError(f"{context}: {name} must {wanted}, got {numbers.tolist()}")
         left, _, right = torch.linalg.svd(turn)  # their product: the nearest orthogonal matrix
         return cls(tuple(map(tuple, (left @ right).tolist())), tuple(numbers[:3, 3].tolist()))
 
@@ -57,17 +54,14 @@ class Pose:
         """Returns world rays in the tree's axes, in float64."""
         rays = rays.to(dtype=torch.float64)
         columns = [o - s for o, s in zip(rays.origin.unbind(1), self.shift, strict=True)]
-        return replace(
-            rays,
-            origin=_rotate(self._inverse, columns),
-            direction=_rotate(self._inverse, rays.direction.unbind(1)),
-        )
+        origin = _rotate(self._inverse, columns)
+        direction = _rotate(self._inverse, rays.direction.unbind(1))
+        return replace(rays, origin=origin, direction=direction)
 
     def to_world(self, hits: Hits) -> Hits:
         """Returns hits with their normals in the world's axes."""
-        return (
-            hits if hits.normal is None else replace(hits, normal=self.world_vectors(hits.normal))
-        )
+        normal = None if hits.normal is None else self.world_vectors(hits.normal)
+        return replace(hits, normal=normal)
 
     def world_vectors(self, directions: Tensor) -> Tensor:
         """Returns world directions (r, 3) of directions in the tree's axes."""
@@ -81,21 +75,17 @@ class Pose:
     def light_to_tree(self, parameter_54: Tensor) -> Tensor:
         """Returns `ShadeParameters` (5, 4) with the light in the tree's axes."""
         parameters = ShadeParameters.read(parameter_54)
-        light = torch.as_tensor(parameters.light, device=parameter_54.device).double()
-        is_point = (
-            torch.as_tensor(parameters.light_kind, device=parameter_54.device) == LightKind.POINT
-        )
-        columns = [
-            torch.where(is_point, a - s, a)
-            for a, s in zip(light.unbind(0), self.shift, strict=True)
-        ]
+        device = parameter_54.device
+        light = torch.as_tensor(parameters.light, device=device).double()
+        is_point = torch.as_tensor(parameters.light_kind, device=device) == LightKind.POINT
+        pairs = zip(light.unbind(0), self.shift, strict=True)
+        columns = [torch.where(is_point, a - s, a) for a, s in pairs]
         light_3 = _rotate(self._inverse, [column[None] for column in columns])[0].to(parameter_54)
         return torch.cat((light_3, parameter_54.reshape(-1)[3:])).view_as(parameter_54)
 
     def box(self, tree_box: Tensor) -> Tensor:
         """Returns (2, 3) corners of the world box around a box in the tree's axes."""
-        columns = tree_box.unbind(1)
-        corners = torch.stack([torch.stack(corner) for corner in product(*columns)])
+        corners = torch.stack([torch.stack(corner) for corner in product(*tree_box.unbind(1))])
         world_corners = self.world_positions(corners)
         return torch.stack((world_corners.amin(0), world_corners.amax(0)))
 
@@ -112,9 +102,7 @@ def checked_poses(context: str, poses: Any) -> Any:
     if poses is None:
         return None
     if isinstance(poses, Mapping):
-        return {
-            name: Pose.of(context, f"pose of {name!r}", matrix) for name, matrix in poses.items()
-        }
+        return {n: Pose.of(context, f"pose of {n!r}", matrix) for n, matrix in poses.items()}
     return Pose.of(context, "pose", poses)
 
 
@@ -126,10 +114,8 @@ def poses_of(context: str, names: Collection[str], poses: Any) -> dict[str, Pose
         by_name: Mapping[str, Pose] = poses or {}
         for name in by_name:
             if name not in names:
-                raise ValueError(
-                    f"{context}: pose of {name!r}: there is no such tree; "
-                    f"there is {', '.join(names)}"
-                )
+                known = f"there is no such tree; there is {', '.join(names)}"
+                raise ValueError(f"{context}: pose of {name!r}: {known}")
         return {name: by_name.get(name) for name in names}
     if len(names) > 1:
         raise ValueError(f"{context}: poses of several trees must be given by name")
@@ -137,9 +123,7 @@ def poses_of(context: str, names: Collection[str], poses: Any) -> dict[str, Pose
 
 
 def pose_alone(context: str, poses: Any) -> Pose | None:
-    """Returns the pose of a tree that has no name, given a result of `checked_poses`; raises
-    ValueError if poses are given by name.
-    """
+    """Returns the pose of `checked_poses` for a tree without name; ValueError if it is by name."""
     if isinstance(poses, Mapping):
         raise ValueError(f"{context}: poses by name are for trees by name")
     pose: Pose | None = poses

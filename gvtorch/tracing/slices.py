@@ -26,16 +26,15 @@ from ..pictures.picture import Picture
 from ..shaders.presets import display_grays
 from ..shaders.transfer_function import TransferFunction
 
+_NAME = "slice_picture"  # in messages
 Position = float | int | str
 Colors = Callable[[np.ndarray], np.ndarray]
 #: Up in the picture of the plane across each axis: rows of files run down, and heads are up.
 UP = {"x": "+z", "y": "+z", "z": "-y"}
 #: Letters of the words for an axis' direction in `ImageInfo.space`.
-_DIRECTION_LETTERS = {
-    w: w[0].upper() for w in ("right", "left", "anterior", "posterior", "superior")
-}
-_DIRECTION_LETTERS["inferior"] = "I"
-_OPPOSITE = {**dict(zip("RAS", "LPI", strict=True)), **dict(zip("LPI", "RAS", strict=True))}
+_DIRECTION_LETTERS = {"right": "R", "left": "L", "anterior": "A", "posterior": "P"}
+_DIRECTION_LETTERS |= {"superior": "S", "inferior": "I"}
+_OPPOSITE = dict(zip("RASLPI", "LPIRAS", strict=True))
 #: Radiological planes, by the letter of the axis across them: name, what is up, what is left.
 _RADIOLOGICAL_PLANES = {
     "S": ("axial", "A", "R"),
@@ -87,27 +86,25 @@ def slice_picture(
         ValueError: An argument is unknown, or out of its range.
         OSError: The store can't be read.
     """
-    context = "slice_picture"
-    check.one_of(context, "axis", axis, ("x", "y", "z", "all"))
-    check.instance(context, "data", data, Volume, Store)
-    scale = check.number(context, "scale", scale, low=0, high=MAX_PICTURE_SIDE, open_low=True)
+    check.one_of(_NAME, "axis", axis, ("x", "y", "z", "all"))
+    check.instance(_NAME, "data", data, Volume, Store)
+    scale = check.number(_NAME, "scale", scale, low=0, high=MAX_PICTURE_SIDE, open_low=True)
     reader = _PlaneReader(data, component, level)
     colors = _colors(data, span, colors, component)
     views = _views(data.info.space, up, radiological=radiological, letters=letters)
     if axis == "all":
         if up is not None:
-            raise ValueError(f"{context}: up is for one plane, not for axis 'all'")
+            raise ValueError(f"{_NAME}: up is for one plane, not for axis 'all'")
         positions = position if isinstance(position, tuple) else (position,) * 3
         if len(positions) != 3:
-            raise ValueError(
-                f"{context}: position must be one or three, for x, y and z, got {position!r}"
-            )
+            wanted = "one or three, for x, y and z"
+            raise ValueError(f"{_NAME}: position must be {wanted}, got {position!r}")
         position_of = dict(zip("xyz", positions, strict=True))
         pixel = min(reader.spacing.values()) / scale
         planes = (reader.colored(n, position_of[n], views[n], pixel, colors) for n in "xyz")
         return _picture(_arranged(*planes))
     if isinstance(position, tuple):
-        raise ValueError(f"{context}: position must be one for axis {axis}, got {position!r}")
+        raise ValueError(f"{_NAME}: position must be one for axis {axis}, got {position!r}")
     pixel = min(reader.spacing[n] for n in "xyz" if n != axis) / scale
     view = views[axis] if up is None else PlaneView("", up)
     return _picture(reader.colored(axis, position, view, pixel, colors))
@@ -117,17 +114,16 @@ def _colors(
     data: Volume | Store, span: tuple[float, float] | None, colors: Colors | None, component: int
 ) -> Colors:
     """Returns the colours of values: those given, or grays over a span."""
-    context = "slice_picture"
     if colors is None:
         black_white = window(data, component=component, background=True) if span is None else span
         if not isinstance(black_white, (tuple, list)) or len(black_white) != 2:
-            raise ValueError(f"{context}: span must be the values of black and white, got {span!r}")
+            raise ValueError(f"{_NAME}: span must be the values of black and white, got {span!r}")
         return TransferFunction(*display_grays()).stretched(*black_white)
     if span is not None:
-        raise ValueError(f"{context}: span is for grays; colors have their own values")
+        raise ValueError(f"{_NAME}: span is for grays; colors have their own values")
     if not callable(colors) or isinstance(colors, type):
         kind = type(colors).__name__
-        raise ValueError(f"{context}: colors must be a function of values or Labels, got a {kind}")
+        raise ValueError(f"{_NAME}: colors must be a function of values or Labels, got a {kind}")
     return colors
 
 
@@ -135,16 +131,15 @@ def _views(
     space: str | None, up: str | None, *, radiological: bool, letters: bool
 ) -> dict[str, PlaneView]:
     """Returns the view of the plane across each axis."""
-    context = "slice_picture"
     if not radiological:
         if letters:
-            raise ValueError(f"{context}: letters are for radiological planes")
+            raise ValueError(f"{_NAME}: letters are for radiological planes")
         return {axis: PlaneView("", up_axis) for axis, up_axis in UP.items()}
     if up is not None:
-        raise ValueError(f"{context}: radiological planes have a fixed up")
+        raise ValueError(f"{_NAME}: radiological planes have a fixed up")
     views = radiological_views(space)
     if not views:
-        raise ValueError(f"{context}: the data does not say where its axes point (info.space)")
+        raise ValueError(f"{_NAME}: the data does not say where its axes point (info.space)")
     return views if letters else {axis: view._replace(letters="") for axis, view in views.items()}
 
 
@@ -175,21 +170,16 @@ def radiological_views(space: str | None) -> dict[str, PlaneView]:
     towards = {axis: _DIRECTION_LETTERS[word] for axis, word in zip("xyz", words, strict=True)}
     views = {}
     for axis, letter in towards.items():
-        name, above, left = _RADIOLOGICAL_PLANES[
-            letter if letter in _RADIOLOGICAL_PLANES else _OPPOSITE[letter]
-        ]
-        in_plane = {n: direction for n, direction in towards.items() if n != axis}
-        rows = next(
-            (n for n, direction in in_plane.items() if direction in (above, _OPPOSITE[above])), ""
-        )
-        columns = next(
-            (n for n, direction in in_plane.items() if direction in (left, _OPPOSITE[left])), ""
-        )
+        across = letter if letter in _RADIOLOGICAL_PLANES else _OPPOSITE[letter]
+        name, above, left = _RADIOLOGICAL_PLANES[across]
+        axis_of = {direction: n for n, direction in towards.items() if n != axis}
+        rows = axis_of.get(above) or axis_of.get(_OPPOSITE[above])
+        columns = axis_of.get(left) or axis_of.get(_OPPOSITE[left])
         if not rows or not columns:
             return {}
-        up = ("+" if in_plane[rows] == above else "-") + rows
+        up = ("+" if towards[rows] == above else "-") + rows
         letters = above + _OPPOSITE[left] + _OPPOSITE[above] + left
-        views[axis] = PlaneView(name, up, in_plane[columns] == left, letters)
+        views[axis] = PlaneView(name, up, towards[columns] == left, letters)
     return views
 
 
@@ -197,13 +187,11 @@ class _PlaneReader:
     """Planes of voxels of one component and level."""
 
     def __init__(self, data: Volume | Store, component: int, level: int) -> None:
-        context = "slice_picture"
         self.data, self.component = data, component
-        is_store = isinstance(data, Store)
-        check.integer(context, "component", component, low=0, high=data.width - 1)
-        self.level = check.integer(context, "level", level, low=0)
-        if level and not is_store:
-            raise ValueError(f"{context}: level is for stores, a volume has one, got {level}")
+        check.integer(_NAME, "component", component, low=0, high=data.width - 1)
+        self.level = check.integer(_NAME, "level", level, low=0)
+        if level and not isinstance(data, Store):
+            raise ValueError(f"{_NAME}: level is for stores, a volume has one, got {level}")
         extent = data.level_extent(level) if isinstance(data, Store) else data.extent
         self.extent = dict(zip("xyz", extent, strict=True))
         self.finest = dict(zip("xyz", data.extent, strict=True))
@@ -214,21 +202,21 @@ class _PlaneReader:
 
     def index(self, axis: str, position: Position) -> int:
         """Returns the index of a voxel of the finest level along an axis."""
-        context, count = "slice_picture", self.finest[axis]
+        count = self.finest[axis]
         if isinstance(position, str):
             text = position.strip()
             if text.endswith("%"):
                 percent = finite_number(text[:-1])
                 share = text if percent is None else percent
-                position = check.number(context, "position", share, low=0, high=100) / 100
+                position = check.number(_NAME, "position", share, low=0, high=100) / 100
             elif re.fullmatch(r"[+-]?\d+", text):
                 position = int(text)
             else:
                 return self._index_in_world(axis, text)
         if isinstance(position, (float, np.floating)):
-            fraction = check.number(context, "position", position, low=0, high=1)
+            fraction = check.number(_NAME, "position", position, low=0, high=1)
             return min(int(fraction * count), count - 1)
-        return check.integer(context, f"position along {axis}", position, low=0, high=count - 1)
+        return check.integer(_NAME, f"position along {axis}", position, low=0, high=count - 1)
 
     def _index_in_world(self, axis: str, text: str) -> int:
         """Returns the index of the voxel at a world position, as in "12.5mm"."""
@@ -247,11 +235,10 @@ class _PlaneReader:
             if text_metres is None or data_metres is None:
                 raise ValueError(f"slice_picture: the unit of the data is {self.unit}, got {text}")
             position *= text_metres / data_metres
-        index = np.floor((position - self.origin[axis]) / self.step[axis] + 0.5)
-        low, high = (
-            self.origin[axis] + (n - 0.5) * self.step[axis] for n in (0, self.finest[axis])
-        )
-        if not 0 <= index < self.finest[axis]:
+        origin, step, count = self.origin[axis], self.step[axis], self.finest[axis]
+        index = np.floor((position - origin) / step + 0.5)
+        if not 0 <= index < count:
+            low, high = (origin + (n - 0.5) * step for n in (0, count))
             ends = f"{low:g} to {high:g} {self.unit or ''}".rstrip()
             raise ValueError(f"slice_picture: {text} lies beyond the data, {axis} is {ends}")
         return int(index)
@@ -275,11 +262,10 @@ class _PlaneReader:
         """Returns (h, w, 3) float32 linear light of the plane; `pixel`: a pixel's world size."""
         up = view.up
         others = [n for n in "zyx" if n != axis]  # of the rows and columns
-        if up not in [sign + n for n in others for sign in "+-"]:
-            raise ValueError(
-                f"slice_picture: up must be +{others[0]}, -{others[0]}, +{others[1]} or "
-                f"-{others[1]} across {axis}, got {up!r}"
-            )
+        choices = [sign + n for n in others for sign in "+-"]
+        if up not in choices:
+            wanted = f"{check.either(choices)} across {axis}"
+            raise ValueError(f"slice_picture: up must be {wanted}, got {up!r}")
         values = self.values(axis, position)
         if up[1] != others[0]:
             values, others = values.T, others[::-1]
@@ -288,10 +274,9 @@ class _PlaneReader:
         columns = columns[::-1] if view.mirrored else columns
         colored = np.asarray(colors(values), np.float32)
         if colored.ndim != 3 or colored.shape[:2] != values.shape or colored.shape[2] < 3:
-            raise ValueError(
-                "slice_picture: colors must return red, green, blue (..., 3) of values (...), "
-                f"got {colored.shape} of {values.shape}"
-            )
+            wanted = "red, green, blue (..., 3) of values (...)"
+            got = f"{colored.shape} of {values.shape}"
+            raise ValueError(f"slice_picture: colors must return {wanted}, got {got}")
         nbytes = len(rows) * len(columns) * colored.shape[2] * colored.itemsize
         check.memory("slice_picture", "the picture", nbytes, torch.device("cpu"))
         image = colored[np.ix_(rows, columns)][..., :3]
@@ -304,9 +289,8 @@ def _voxel_of_pixels(count: int, size: float) -> np.ndarray:
     """Returns the voxel of each pixel along an axis, for `count` voxels of `size` pixels each."""
     pixels = max(1, round(count * size))
     if pixels > MAX_PICTURE_SIDE:
-        raise ValueError(
-            f"slice_picture: {pixels} pixels are more than {MAX_PICTURE_SIDE}: use a smaller scale"
-        )
+        problem = f"{pixels} pixels are more than {MAX_PICTURE_SIDE}"
+        raise ValueError(f"slice_picture: {problem}: use a smaller scale")
     return ((np.arange(pixels) + 0.5) * (count / pixels)).astype(np.int64)
 
 

@@ -81,6 +81,5 @@ class ThroughLens:
             last = last.clamp(max=focus)
         else:
             first = first.clamp(min=focus)
-        return replace(
-            rays, cone=torch.stack((width, growth), 1), range=torch.stack((first, last), 1)
-        )
+        cone, span = torch.stack((width, growth), 1), torch.stack((first, last), 1)
+        return replace(rays, cone=cone, range=span)

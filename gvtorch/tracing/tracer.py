@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from ..ops.registry import choose_backend
 from ..pool import N3Tree
 from ..shaders.module import PART_SAMPLES, ModuleShader
 from ..shaders.shader import Sampling, Shader, check_shader, interval_levels
-from .composite import reaches_depth, tree_span
+from .composite import merged, reaches_depth, tree_span
 from .options import RenderOptions
 from .pose import pose_alone
 
@@ -96,10 +96,8 @@ class Tracer:
 
     def with_shader(self, shader: Shader, options: RenderOptions) -> Tracer:
         """Returns a tracer of the same frame with another shader."""
-        arguments = self.arguments
-        return Tracer(
-            self.tree, shader, options, by_level=arguments.by_level, frame_1=arguments.frame_1
-        )
+        args = self.arguments
+        return Tracer(self.tree, shader, options, by_level=args.by_level, frame_1=args.frame_1)
 
     def to_tree(self, rays: Rays) -> Rays:
         """Returns world rays in the tree's axes."""
@@ -120,13 +118,10 @@ class Tracer:
             fields = ops.trace_rays(ray_arguments, self.arguments, backend=self.backend)
         else:
             parameters = self.shader.parameter_tensor(self.tree, self.dtype)
-            shading = (
-                self.shading,
-                parameters if self.pose is None else self.pose.light_to_tree(parameters),
-            )
-            fields = ops.shade_rays(
-                ray_arguments, self.arguments, *shading, op=self.shader.op, backend=self.backend
-            )
+            if self.pose is not None:
+                parameters = self.pose.light_to_tree(parameters)
+            reads = (ray_arguments, self.arguments, self.shading, parameters)
+            fields = ops.shade_rays(*reads, op=self.shader.op, backend=self.backend)
         hits = Hits(**dict(zip(_RESULTS, fields, strict=False)))
         if self.label_names is None or hits.features is None:
             return hits
@@ -140,10 +135,8 @@ class Tracer:
             values = batch.values(shader.channels)
             positions, directions = batch.positions, batch.directions
             if self.pose is not None:
-                positions, directions = (
-                    self.pose.world_positions(positions),
-                    self.pose.world_vectors(directions),
-                )
+                positions = self.pose.world_positions(positions)
+                directions = self.pose.world_vectors(directions)
             color, alpha = shader(values, positions, directions, batch.lengths)
             return color, alpha[:, 0]
 
@@ -155,9 +148,8 @@ class Tracer:
         size = (shader.samples or _MAX_SAMPLES[rays.origin.device.type]) // PART_SAMPLES
         if count <= size:
             return trace_block(rays)
-        blocks = [vars(trace_block(rays[start : start + size])) for start in range(0, count, size)]
-        names = [name for name, field in blocks[0].items() if field is not None]
-        return Hits(**{name: torch.cat([block[name] for block in blocks]) for name in names})
+        blocks = [trace_block(rays[start : start + size]) for start in range(0, count, size)]
+        return merged(blocks, torch.cat)
 
 
 def _checked_channel(tree: N3Tree, shader: Shader, options: RenderOptions) -> str:
@@ -167,9 +159,8 @@ def _checked_channel(tree: N3Tree, shader: Shader, options: RenderOptions) -> st
     first_channel = tree.channel_names[0]
     other_channel = tree.bricks.channels.get(str(shader.other))
     if other_channel is not None and other_channel.coarse and channel != first_channel:
-        raise ValueError(
-            f"render: channel {shader.other!r} was made of {first_channel!r}, not of {channel!r}"
-        )
+        source = f"was made of {first_channel!r}, not of {channel!r}"
+        raise ValueError(f"render: channel {shader.other!r} {source}")
     _check_labels(tree, shader, channel)
     return channel
 
@@ -185,11 +176,9 @@ def _check_labels(tree: N3Tree, shader: Shader, channel: str) -> None:
         return
     for name in (channel, *shader.channels):
         if name in tree.labels:
-            kind = type(shader).__name__
-            raise ValueError(
-                f"render: channel {name!r} holds labels, which {kind} would blend: "
-                "gv.Labels() (--shader labels) shows them"
-            )
+            problem = f"holds labels, which {type(shader).__name__} would blend"
+            hint = "gv.Labels() (--shader labels) shows them"
+            raise ValueError(f"render: channel {name!r} {problem}: {hint}")
 
 
 def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
@@ -203,10 +192,8 @@ def _check_step(tree: N3Tree, step: float, options: RenderOptions) -> None:
         if options.dtype == torch.float32:
             limit, hint = MAX_INTERVALS, f"{hint}; dtype=torch.float64 tells more apart"
     if not length / step <= limit:
-        raise ValueError(
-            f"render: step cuts a ray of {length:g} into {length / step:.4g} intervals of "
-            f"{step:g}, more than {limit:.4g} ({hint})"
-        )
+        count = f"{length / step:.4g} intervals of {step:g}, more than {limit:.4g}"
+        raise ValueError(f"render: step cuts a ray of {length:g} into {count} ({hint})")
 
 
 @dataclass(frozen=True)
@@ -222,9 +209,8 @@ class Batch:
         """Returns (k, c) values of channels side by side, by default of the tracer's one."""
         columns, tree = [], self.tracer.tree
         for name in channels or (self.tracer.channel,):
-            arguments = self.tracer.arguments._replace(
-                bricks_bzyxc=tree.bricks.bricks[name], constant_tnc=tree.nodes.constants[name]
-            )
+            bricks, constants = tree.bricks.bricks[name], tree.nodes.constants[name]
+            arguments = self.tracer.arguments._replace(bricks_bzyxc=bricks, constant_tnc=constants)
             reads = (arguments, self.segments, self.samples)
             columns.append(ops.sample_bricks(self.rays, *reads, backend=self.tracer.backend))
         return columns[0] if len(columns) == 1 else torch.cat(columns, 1)
@@ -301,10 +287,9 @@ def march(
     if rays.transmittance is not None:  # some may have ended in an earlier piece
         open_index = (clear > 1 - stop_alpha).nonzero()[:, 0]
         open_rays = open_rays.some(open_index)
+    walk = partial(ops.trace_segments, limit=limit, by_node=by_node, backend=backend)
     while len(open_index):
-        segments = ops.trace_segments(
-            open_rays, arguments, state, limit=limit, by_node=by_node, backend=backend
-        )
+        segments = walk(open_rays, arguments, state)
         missed[open_index] |= segments.missed
         nodes[open_index] += segments.counts[:, 2]
         batch = Batch(tracer, open_rays, segments, ops.list_samples(segments))
@@ -324,12 +309,9 @@ def march(
             hit = passes.nonzero()[:, 0]
             fraction = torch.log(hit_clear / clear_before[hit]) / torch.log1p(-alpha[hit])
             fraction = torch.where(alpha[hit] < 1, fraction.clamp(0, 1), 0.0)
-            hit_depth = (
-                batch.starts[hit]
-                + fraction * batch.lengths[hit, 0]
-                + batch.entry_distance[batch.ray[hit]]
-            )
-            depth[open_index[batch.ray[hit]]] = hit_depth.to(like.dtype)
+            hit_ray, in_tree = batch.ray[hit], batch.starts[hit] + fraction * batch.lengths[hit, 0]
+            hit_depth = in_tree + batch.entry_distance[hit_ray]
+            depth[open_index[hit_ray]] = hit_depth.to(like.dtype)
             is_open = (segments.counts[:, 1] >= limit) & (clear_after > 1 - stop_alpha)
             left = is_open.nonzero()[:, 0]
         open_rays, open_index, state = open_rays.some(left), open_index[left], segments.state[left]

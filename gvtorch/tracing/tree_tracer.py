@@ -67,10 +67,8 @@ class TreeTracer(torch.nn.Module):
         check_shader("TreeTracer", "shader", shader)
         if shader.uses_torch:
             kind = type(shader).__name__
-            raise ValueError(
-                f"TreeTracer: shader must be one of the kernels', got {kind}: hold that in the net "
-                "instead, and trace with gv.trace"
-            )
+            hint = "hold that in the net instead, and trace with gv.trace"
+            raise ValueError(f"TreeTracer: shader must be one of the kernels', got {kind}: {hint}")
         options = RenderOptions(
             step=step,
             stop_alpha=stop_alpha,
@@ -122,9 +120,8 @@ class TreeTracer(torch.nn.Module):
         """
         placed = as_camera("TreeTracer.rays", camera).placed(self.box)
         rays = placed.rays(self.place_33.device)
-        origin, direction, cone, ranges = (
-            placed.image(column) for column in (rays.origin, rays.direction, rays.cone, rays.range)
-        )
+        columns = (rays.origin, rays.direction, rays.cone, rays.range)
+        origin, direction, cone, ranges = map(placed.image, columns)
         return origin, direction, cone, ranges
 
     def __getstate__(self) -> dict[str, Any]:
@@ -140,10 +137,8 @@ class TreeTracer(torch.nn.Module):
         namespace, name = state["shade_rays"].split(".")
         op = getattr(getattr(torch.ops, namespace), name, None)
         if op is None:
-            raise RuntimeError(
-                f"TreeTracer: op {name} is not loaded: torch.ops.load_library of its shader's "
-                "libraries first"
-            )
+            hint = "torch.ops.load_library of its shader's libraries first"
+            raise RuntimeError(f"TreeTracer: op {name} is not loaded: {hint}")
         super().__setstate__({**state, "shade_rays": op})
         _check_words(self._buffers, "")
 
@@ -167,13 +162,11 @@ class TreeTracer(torch.nn.Module):
         Args:
             origin: (..., 3) float32 or float64, as the others: rays enter the tree in float64.
             direction: (..., 3) unit length.
-            cone: (..., 2) width at the origin and growth per unit distance; zeros for the finest
-                level.
+            cone: (..., 2) width at the origin and growth per unit distance; zeros: finest level.
             range: (..., 2) first and last distance.
 
         Returns:
-            color (..., 3) premultiplied, alpha (..., 1), depth (..., 1), all float32; samples (...)
-            int32.
+            float32 color (..., 3) premultiplied, alpha and depth (..., 1); int32 samples (...).
         """
         color, alpha, depth, samples, _, _ = self.hits(origin, direction, cone, range)
         return color, alpha, depth, samples
@@ -200,12 +193,9 @@ class TreeTracer(torch.nn.Module):
                 *rays, *arguments, *self.shading(), self.parameter_54
             )
             normal, features = _unflatten(normal, leading), _unflatten(features, leading)
-        color, alpha, depth = (
-            _unflatten(color, leading),
-            _unflatten(alpha, leading),
-            _unflatten(depth, leading),
-        )
-        return color, alpha, depth, samples.reshape(leading), normal, features
+        color, alpha = _unflatten(color, leading), _unflatten(alpha, leading)
+        depth, samples = _unflatten(depth, leading), samples.reshape(leading)
+        return color, alpha, depth, samples, normal, features
 
     def arguments(self) -> TraceArguments:
         """Returns the op's arguments on the tree."""

@@ -18,7 +18,7 @@ from ..base import check
 from ..base.records import Hits, Rays
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
-from .composite import columns_of, join_hits, over
+from .composite import join_hits, merged, over
 from .effects import TreeTrace, box_spans
 from .options import RenderOptions
 from .overlapping import mix_by_sample
@@ -76,8 +76,7 @@ def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     trees = [tree for tree in trees if not tree.tracer.shader.shows_nothing] or trees[:1]
     if len(trees) == 1:
         return trees[0].trace(rays)
-    spans = box_spans(trees, rays)
-    first, last = spans.unbind(2)
+    first, last = box_spans(trees, rays).unbind(2)
     pairs = combinations(range(len(trees)), 2)
     shared = [torch.maximum(first[a], first[b]) < torch.minimum(last[a], last[b]) for a, b in pairs]
     is_shared = torch.stack(shared).any(0)
@@ -104,12 +103,15 @@ def _trace_in_order(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Composites trees in the order in which rays enter their boxes."""
     first, last = box_spans(trees, rays).unbind(2)
     order = torch.where(first <= last, first, torch.inf).argsort(dim=0, stable=True)  # (m, r)
-    hits = [tree.trace(rays) for tree in trees]
-    ordered = {name: _in_ray_order(hits, name, order) for name in vars(hits[0])}
-    ranked = [
-        Hits(**{name: values[rank] for name, values in ordered.items()})
-        for rank in range(len(trees))
-    ]
+
+    def in_ray_order(columns: list[Tensor]) -> Tensor:
+        stacked = torch.stack(columns)  # (m, r) or (m, r, c)
+        index = order if stacked.dim() == 2 else order[:, :, None].expand_as(stacked)
+        return stacked.gather(0, index)
+
+    ordered = vars(merged([tree.trace(rays) for tree in trees], in_ray_order)).items()
+    fields: dict[str, Tensor] = {name: field for name, field in ordered if field is not None}
+    ranked = [Hits(**{n: f[rank] for n, f in fields.items()}) for rank in range(len(trees))]
     return replace(reduce(over, ranked), normal=_mean_normal(ranked))
 
 
@@ -123,14 +125,3 @@ def _mean_normal(ranked: Sequence[Hits]) -> Tensor | None:
         total = total + (1 - alpha) * behind
         alpha = alpha + (1 - alpha) * hits.alpha
     return normalize(total, dim=1)
-
-
-def _in_ray_order(hits: Sequence[Hits], name: str, order: Tensor) -> Sequence[Any]:
-    """Returns a field (r, ...) of m trees, in the order (m, r) of the trees along each ray."""
-    columns = columns_of(hits, name)
-    if columns is None:
-        return [None] * len(hits)
-    stacked = torch.stack(columns)
-    if stacked.dim() == 3:
-        order = order[:, :, None].expand_as(stacked)
-    return stacked.gather(0, order).unbind(0)

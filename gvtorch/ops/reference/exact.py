@@ -68,9 +68,8 @@ def sqrt_exact(value: Tensor) -> Tensor:
     high = scaled - (scaled - approximate)
     low, square = approximate - high, approximate * approximate
     remainder = value.detach() - square - (high * high - square + 2 * high * low + low * low)
-    return root + torch.where(
-        (approximate > 0) & (approximate < 1e140), remainder / (2 * approximate), 0.0
-    )
+    correctable = (approximate > 0) & (approximate < 1e140)
+    return root + torch.where(correctable, remainder / (2 * approximate), 0.0)
 
 
 def _polynomial(x: Tensor, highest: float, *coefficients: float) -> Tensor:
@@ -106,9 +105,8 @@ def log_exact(value: Tensor) -> Tensor:
     """
     detached = value.detach()
     exponent, s, series = _log_series(detached)
-    logarithm = torch.where(
-        detached < torch.inf, exponent * 0.6931471805599453 + s * series, detached
-    )
+    finite = exponent * 0.6931471805599453 + s * series
+    logarithm = torch.where(detached < torch.inf, finite, detached)
     return logarithm + (value - detached) / detached if value.requires_grad else logarithm
 
 
@@ -155,19 +153,15 @@ def exp2_exact(value: Tensor) -> Tensor:
     integer = torch.floor(x + 0.5)
     f = x - integer
     series = _exp2_slope(f) * f + 1.0
-    power = ((integer.to(torch.int64 if is_double else torch.int32) + bias) << digits).view(
-        value.dtype
-    )
-    return torch.where(underflows, 0.0, series * power)
+    bits = (integer.to(torch.int64 if is_double else torch.int32) + bias) << digits
+    return torch.where(underflows, 0.0, series * bits.view(value.dtype))
 
 
 def absorbed_by(halvings: Tensor) -> Tensor:
     """Returns 1 - 2^-halvings, the share of light that is absorbed; accurate if small, too."""
     thin = halvings < 0.5
-    small_halvings = torch.where(thin, halvings, 0.0)
-    return torch.where(
-        thin, _exp2_slope(-small_halvings) * small_halvings, 1 - exp2_exact(-halvings)
-    )
+    small = torch.where(thin, halvings, 0.0)
+    return torch.where(thin, _exp2_slope(-small) * small, 1 - exp2_exact(-halvings))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -191,9 +185,8 @@ def unit(v: Tensor) -> Tensor:
 def power(x: Tensor, exponent: float | Tensor) -> Tensor:
     """Returns x^exponent for x in [0, 1]."""
     positive = x > TINY
-    return torch.where(
-        positive, exp2_exact(log2_exact(torch.where(positive, x, 1.0)) * exponent), 0.0
-    )
+    raised = exp2_exact(log2_exact(torch.where(positive, x, 1.0)) * exponent)
+    return torch.where(positive, raised, 0.0)
 
 
 def stretch(alpha: Tensor, lengths: Tensor) -> Tensor:

@@ -40,17 +40,12 @@ class LabelBricks(ChannelBricks):
         cell = smaller(torch.floor(clamped), torch.full_like(clamped, high))
         from_center = clamp(position - cell, -0.5, 0.5)
         cell = cell.to(torch.int64)
-        constant = self.constants(holder, real)[:, self.component]
-        value = torch.where(holder.brick >= 0, self.voxel_value(holder, cell, real), constant)
+        value = self.constants(holder, real)[:, self.component]
+        if len(self.bricks_bzyxc):
+            brick, (x, y, z) = holder.brick.clamp(min=0), cell.unbind(1)
+            stored = self.bricks_bzyxc[brick, z, y, x, self.component].to(real)
+            value = torch.where(holder.brick >= 0, stored, value)
         return Nearest(value, cell, from_center)
-
-    def voxel_value(self, holder: Holder, cell: Tensor, real: torch.dtype) -> Tensor:
-        """Returns (r,) values of voxels (r, 3); undefined where there is no brick."""
-        x, y, z = cell.unbind(1)
-        if self.bricks_bzyxc.shape[0] == 0:
-            return torch.zeros_like(x, dtype=real)
-        brick = holder.brick.clamp(min=0)
-        return self.bricks_bzyxc[brick, z, y, x, self.component].to(real)
 
     def toward_others(self, holder: Holder, nearest: Nearest) -> Tensor:
         """Returns (r, 3) vectors, in voxels and of any length, towards the surrounding voxels of
@@ -104,22 +99,17 @@ class Labels(Lit):
 
     def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
         fine, coarse = probe.nodes.fine, probe.nodes.coarse
-        blended = probe.blend(piece.middle, partial(self.contribution, piece, probe))
+        blended = probe.blend(piece.middle, partial(self.contribution, piece))
         color, alpha, normal = blended.split((3, 1, 3), 1)
-        hidden = ~(self.contribution(piece, probe, fine)[:, 3] > 0)
+        hidden = ~(self.contribution(piece, fine)[:, 3] > 0)
         holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
         label = self.row_of(self.channel.nearest(holder, piece.middle).value)
-        clear_after, clear, hit_clear = (
-            self.sum.clear * (1 - alpha[:, 0]),
-            self.sum.clear,
-            self.sum.hit_clear,
-        )
+        clear, hit_clear = self.sum.clear, self.sum.hit_clear
+        clear_after = clear * (1 - alpha[:, 0])
         hit = mask & (clear_after < hit_clear) & (clear >= hit_clear)
         self.features = torch.where(hit[:, None], (1 + label)[:, None].to(alpha), self.features)
         shown = mask & (alpha[:, 0] > 0)
-        self.normal = torch.where(
-            shown[:, None], self.normal + clear[:, None] * normal, self.normal
-        )
+        self.add_normal(clear[:, None] * normal, shown)
         self.sum.add_light(clear[:, None] * color, shown)
         self.sum.absorb(alpha[:, 0], piece, shown)
 
@@ -128,7 +118,7 @@ class Labels(Lit):
         low, last = self.transfer.domain_2[0], len(self.transfer.opaque_m) - 1
         return clamp(label - low, 0, last).to(torch.int64)
 
-    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+    def contribution(self, piece: Piece, holder: Holder) -> Tensor:
         """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
         t, table = piece.middle, self.transfer.table_lm4
         nearest = self.channel.nearest(holder, t)
@@ -138,9 +128,8 @@ class Labels(Lit):
         alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
         normal = torch.zeros_like(color)
         if self.light.parameters.own_as(LabelNumbers).lit > 0:
-            vector = self.channel.toward_others(holder, nearest) * (
-                holder.scale[:, None] / self.light.cube
-            )
+            voxels = self.channel.toward_others(holder, nearest)
+            vector = voxels * (holder.scale[:, None] / self.light.cube)
             normal = unit(torch.where((holder.brick >= 0)[:, None], vector, 0.0))
             faces_away = dot(normal, self.light.direction) > 0
             normal = torch.where(faces_away[:, None], -normal, normal)

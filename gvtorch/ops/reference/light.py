@@ -161,9 +161,8 @@ class Light:
         along = dot(half_vector, times(half_vector)) - spread + divide(correction, 3.0, correction)
         effective_shininess = divide(shininess, 1 + shininess * spread, spread)
         brightness = divide(1 + effective_shininess, 1 + shininess, effective_shininess)
-        highlight = brightness * power(
-            clamp(along / (alignment + correction), 0, 1), effective_shininess * 0.5
-        )
+        cosine_square = clamp(along / (alignment + correction), 0, 1)
+        highlight = brightness * power(cosine_square, effective_shininess * 0.5)
         highlight = torch.where(facing > 0, highlight, zero)
         return self.lit(base, 1 - share + share * facing, share * highlight), normal
 
@@ -219,11 +218,8 @@ class Shadows:
         left out, so that a point does not shadow itself.
         """
         ray_index = mask.nonzero()[:, 0]
-        t, direction, eye_beam = (
-            t[ray_index],
-            direction[ray_index],
-            self.walk.intervals.beam[ray_index],
-        )
+        t, direction = t[ray_index], direction[ray_index]
+        eye_beam = self.walk.intervals.beam[ray_index]
         origin, exact_origin = rounded(eye_beam.along(t), eye_beam.scene.deep, t.dtype)
         beam = replace(
             eye_beam,
@@ -239,10 +235,8 @@ class Shadows:
         length_l = self.walk.intervals.length_l
         intervals = Intervals(beam, length_l[0], len(length_l))
         intervals.next(torch.ones_like(mask[ray_index]))
-        limits = light.faintest(shader.stop_clear), light.scatters
-        visitor = ShadowVisitor(
-            shader.transfer, shader.channel, shader, direction, torch.ones_like(t), *limits
-        )
+        clear, limits = torch.ones_like(t), (light.faintest(shader.stop_clear), light.scatters)
+        visitor = ShadowVisitor(shader.transfer, shader.channel, shader, direction, clear, *limits)
         walk = Walk(intervals, self.walk.tree, shader.channel)
         walk.follow(visitor)
         self.samples[ray_index] += walk.samples

@@ -58,10 +58,12 @@ class Lit(Plain):
         color = self.light.shade(rgba[:, :3], normal, t, shadow)
         color = torch.where(shown[:, None], color, rgba[:, :3])
         weight = self.sum.clear * rgba[:, 3]
-        self.normal = torch.where(
-            shown[:, None], self.normal + weight[:, None] * normal, self.normal
-        )
+        self.add_normal(weight[:, None] * normal, shown)
         self.sum.add(torch.cat((color, rgba[:, 3:]), 1), piece, mask)
+
+    def add_normal(self, normal: Tensor, mask: Tensor) -> None:
+        """Adds normals (r, 3), weighted by light, where `mask` is true."""
+        self.normal = torch.where(mask[:, None], self.normal + normal, self.normal)
 
     def light_share(self, shadows: Shadows, t: Tensor, shown: Tensor, facing: Tensor) -> Tensor:
         """Returns (r,) the share of light that reaches t (r,), where it is seen and faces it."""

@@ -63,9 +63,8 @@ class Visit(NodePair):
         """Returns (r,) bool: the interval's middle is in the node and wants the same levels."""
         middle = intervals.middle
         cone = intervals.beam.cone(middle)
-        fits = torch.where(
-            self.voxel_fits, (cone >= self.voxel) & (cone < self.voxel_above), cone < self.voxel
-        )
+        between = (cone >= self.voxel) & (cone < self.voxel_above)
+        fits = torch.where(self.voxel_fits, between, cone < self.voxel)
         return intervals.inside() & (middle < self.exit) & fits
 
 
@@ -102,8 +101,7 @@ class Probe:
 
     def blend(self, t: Tensor, read: Callable[[Holder], Tensor]) -> Tensor:
         """Returns (r,) or (r, c): `read` of the fine node, blended with `read` of the coarse one,
-        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is as wide as
-        `voxel_above`.
+        whose weight grows from 0 where the cone is `voxel` wide to 1 where it is `voxel_above`.
         """
         nodes = self.nodes
         mixed, value = nodes.fine.node != nodes.coarse.node, read(nodes.fine)
@@ -283,12 +281,8 @@ class Walk:
 
             # A node of one value, or of none, is crossed in one step; else one interval is added.
             one_step = active & (visit.uniform | visit.invisible)
-            level, base, count, start = (
-                intervals.level,
-                intervals.base,
-                intervals.count,
-                intervals.start,
-            )
+            level, base = intervals.level, intervals.base
+            count, start = intervals.count, intervals.start
             middle, odd, length = intervals.middle, visit.uniform | intervals.cut, intervals.length
             moving = active
             while moving.any():
@@ -307,9 +301,7 @@ class Walk:
             active = intervals.inside() & visitor.goes_on(leaving)
 
     def find(self, ray_index: Tensor, t: Tensor, visitor: Visitor) -> None:
-        """Finds the nodes of the rays `ray_index` (k,) at t (r,); stamps what is used and requests
-        what is absent.
-        """
+        """Finds nodes of rays `ray_index` (k,) at t (r,); stamps the used, requests the absent."""
         tree, beam, t = self.tree, self.intervals.beam[ray_index], t[ray_index]
         cone, finest = beam.cone(t), tree.levels.finest_cells(beam.at(t))
         wanted = tree.levels.wanted(cone)
@@ -319,8 +311,8 @@ class Walk:
             return visitor.hides(ray_index, *self.channel.value_range(node, t.dtype))
 
         descent = tree.descend(finest, wanted, hides)
-        voxel_fits = voxel <= cone
-        blends = voxel_fits & (wanted > 0)
+        fits = voxel <= cone
+        blends = fits & (wanted > 0)
         only_fine = ~blends | (descent.coarse < 0)
         fine = tree.holder(descent.fine, descent.fine_depth, finest, beam)
         coarse_node = torch.where(only_fine, descent.fine, descent.coarse)
@@ -335,13 +327,10 @@ class Walk:
         same = visitor.same(fine.node.clamp(min=0), coarse.node.clamp(min=0))
         uniform = ~invisible & (fine.brick < 0) & (coarse.brick < 0) & same
         exit_t = beam.leave(*tree.levels.corners(finest, descent.depth))
-        visit = Visit(
-            fine, coarse, voxel, voxel_above, t, wanted, voxel_fits, exit_t, invisible, uniform
-        )
+        visit = Visit(fine, coarse, voxel, voxel_above, t, wanted, fits, exit_t, invisible, uniform)
         self.visit = self.visit.index_put((ray_index,), visit)
-        self.visits = self.visits.index_add(
-            0, ray_index, torch.ones_like(ray_index, dtype=torch.int32)
-        )
+        one = torch.ones_like(ray_index, dtype=torch.int32)
+        self.visits = self.visits.index_add(0, ray_index, one)
         self.missed = self.missed.index_put((ray_index,), self.missed[ray_index] | missed)
 
 

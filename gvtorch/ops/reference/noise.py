@@ -93,17 +93,15 @@ def _simplex(axes: Sequence[Tensor], arguments: NoiseArguments) -> Tensor:
     skew = sum(axes[1:], axes[0]).detach() * _SKEW[n]
     floors = [(coordinate.detach() + skew).floor() for coordinate in axes]
     unskew = sum(floors[1:], floors[0]) * _UNSKEW[n]
-    offsets = [
-        coordinate - (floor - unskew) for coordinate, floor in zip(axes, floors, strict=True)
-    ]
+    pairs = zip(axes, floors, strict=True)
+    offsets = [coordinate - (floor - unskew) for coordinate, floor in pairs]
     lattice = [floor.to(torch.int32) for floor in floors]
     rank, total = _ranks(offsets), torch.zeros_like(axes[0])
     for corner in range(n + 1):
         # 1 along the `corner` axes of the largest offsets
         steps = [(axis_rank + corner >= n).to(torch.int32) for axis_rank in rank]
-        away = [
-            offset - step + corner * _UNSKEW[n] for offset, step in zip(offsets, steps, strict=True)
-        ]
+        moves = zip(offsets, steps, strict=True)
+        away = [offset - step + corner * _UNSKEW[n] for offset, step in moves]
         square = away[0] * away[0]
         for distance in away[1:]:
             square = square + distance * distance
@@ -146,10 +144,8 @@ def _simplex_hash(lattice: list[Tensor], arguments: NoiseArguments) -> Tensor:
     """
     if len(lattice) == 3:
         total = sum(lattice[1:], lattice[0])
-        lattice = [
-            wrapped(6 * coordinate - total, 6 * period)
-            for coordinate, period in zip(lattice, arguments.period, strict=True)
-        ]
+        pairs = zip(lattice, arguments.period, strict=True)
+        lattice = [wrapped(6 * coordinate - total, 6 * period) for coordinate, period in pairs]
     bits = scramble(lattice[0], arguments.salt[0])
     for coordinate, salt in zip(lattice[1:], arguments.salt[1:], strict=False):
         bits = join(bits, scramble(coordinate, salt))
@@ -287,9 +283,7 @@ def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor
     """
     first = axes[0]
     at_once = first.device.type != "cpu" or torch.compiler.is_compiling()
-    needs_gradient = torch.is_grad_enabled() and any(
-        coordinate.requires_grad for coordinate in axes
-    )
+    needs_gradient = torch.is_grad_enabled() and any(axis.requires_grad for axis in axes)
     if at_once or needs_gradient or first.numel() <= CHUNK:
         return evaluate(*axes)
     flat = [coordinate.reshape(-1) for coordinate in axes]

@@ -57,9 +57,8 @@ def power_ranges(z: Tensor, reach: Tensor, n: int) -> tuple[Tensor, Tensor, Tens
     angle_change = ratio + (math.pi / 2 - 1) * (ratio * ratio * ratio)
     _, sine = _complex_power(up / safe_radius, axis_distance / safe_radius, n)
     sine_bound = larger(sine, -sine) + n * angle_change
-    least_sine = _at_least(
-        _at_least(axis_distance - reach, 0.0) / _at_least(outer_radius, 1e-30), 1 / n
-    )
+    least_ratio = _at_least(axis_distance - reach, 0.0) / _at_least(outer_radius, 1e-30)
+    least_sine = _at_least(least_ratio, 1 / n)
     around = clamp(smaller(sine_bound, torch.ones_like(sine_bound)) / least_sine, 1.0, n)
     low, high = n * _product(inner_radius, n - 1), n * _product(outer_radius, n - 1)
     return high * around, low, high
@@ -113,17 +112,14 @@ def orbits(point_p3: Tensor, orbit: TwinOrbit) -> Tensor:
 
 
 def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor:
-    """Iterates the centres of balls, and for each a radius within which the orbits of all points of
-    the ball are; see `ops.orbit_bounds`.
+    """Iterates centres of balls, and radii that hold the orbits of all their points; see
+    `ops.orbit_bounds`.
     """
     z, reach, bailout = center_k3.mT, reach_k, orbit.bailout_1
     constant, added_reach, added_separation = z, reach, 1.0
     if orbit.constant_3 is not None:
-        constant, added_reach, added_separation = (
-            orbit.constant_3[:, None],
-            torch.zeros_like(reach),
-            0.0,
-        )
+        constant, added_reach = orbit.constant_3[:, None], torch.zeros_like(reach)
+        added_separation = 0.0
     low_separation = high_separation = torch.ones_like(reach)
     low, high = torch.full_like(reach, math.inf), torch.full_like(reach, -math.inf)
     inside = torch.ones_like(reach, dtype=torch.bool)  # some point may not have escaped yet
@@ -144,12 +140,10 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor
         stepped, _ = orbit.step(z)
         z = torch.where(inside, stepped + constant, z)
         reach = torch.where(inside, stretch * reach + added_reach, reach)
-        low_separation = torch.where(
-            inside, low_factor * low_separation + added_separation, low_separation
-        )
-        high_separation = torch.where(
-            inside, high_factor * high_separation + added_separation, high_separation
-        )
+        low_next = low_factor * low_separation + added_separation
+        high_next = high_factor * high_separation + added_separation
+        low_separation = torch.where(inside, low_next, low_separation)
+        high_separation = torch.where(inside, high_next, high_separation)
     deep = torch.full_like(low, -INSIDE)
     low = torch.where(inside, smaller(low, deep), low)
     high = torch.where(inside, larger(high, deep), high)
@@ -158,9 +152,8 @@ def orbit_bounds(center_k3: Tensor, reach_k: Tensor, orbit: TwinOrbit) -> Tensor
 
 def _estimate(radius: Tensor, separation: Tensor, orbit: TwinOrbit) -> Tensor:
     """Returns distance estimates of orbits at `radius`; `separation`: their neighbours' stretch."""
-    return (
-        0.5 * radius * log_exact(radius) / separation if orbit.logarithmic else radius / separation
-    )
+    length = 0.5 * radius * log_exact(radius) if orbit.logarithmic else radius
+    return length / separation
 
 
 def _squared(z: Tensor) -> Tensor:

@@ -27,10 +27,8 @@ class Rows:
 
     def index_put(self, index: tuple[Tensor], rows: Self) -> Self:
         """Returns a copy with the rows of some rays replaced."""
-        own_fields = vars(self).items()
-        return replace(
-            self, **{name: row.index_put(index, vars(rows)[name]) for name, row in own_fields}
-        )
+        changed = vars(rows)
+        return replace(self, **{n: f.index_put(index, changed[n]) for n, f in vars(self).items()})
 
 
 class SceneBox(NamedTuple):
@@ -71,14 +69,8 @@ class Beam(Rows):
         high_real, deep = high.to(real), is_deep(args)
         last_real = (high_real * (1 - 2.0**-23)).double()
         scene = SceneBox(high, high * (1 - 2.0**-50) if deep else last_real, deep)
-        columns = (
-            direction,
-            near_cone + growth * moved,
-            growth,
-            rays.range_r2[:, 0] - moved,
-            rays.range_r2[:, 1] - moved,
-            moved,
-        )
+        first, last = (rays.range_r2 - moved[:, None]).unbind(1)
+        columns = (direction, near_cone + growth * moved, growth, first, last, moved)
         real_direction, *numbers = (column.to(real) for column in columns)
         start = rounded(origin + moved[:, None] * direction, deep, real)
         beam = cls(scene, *start, real_direction, *numbers).clipped()

@@ -1,6 +1,4 @@
-"""The torch twins of the ops for module shaders: segments of rays, samples in bricks, compositing.
-See cpp_ext/csrc/shaders/segments.h.
-"""
+"""The torch twins of the ops for module shaders, as in cpp_ext/csrc/shaders/segments.h."""
 
 from __future__ import annotations
 
@@ -122,10 +120,8 @@ def sample_bricks(
     nodes, bricks, depths = (field.to(torch.int64)[segment].unbind(1) for field in node_fields)
     levels = Levels(args, real)
     finest = levels.finest_cells(beam.at(lookup_t))
-    fine, coarse = (
-        levels.holder(node, brick, depth, finest, beam)
-        for node, brick, depth in zip(nodes, bricks, depths[:2], strict=True)
-    )
+    words = zip(nodes, bricks, depths[:2], strict=True)
+    fine, coarse = (levels.holder(node, brick, d, finest, beam) for node, brick, d in words)
     channel = ChannelBricks.of(args)
     probe = Probe(beam, NodePair(fine, coarse, *levels.voxels(depths[2])), channel)
     return torch.where(valid[:, None], probe.numbers(channel, t), 0.0)

@@ -79,12 +79,9 @@ class Isosurface(Lit):
     def __post_init__(self) -> None:
         super().__post_init__()
         zeros = torch.zeros_like(self.sum.clear)
-        numbers = self.light.parameters.own_as(IsosurfaceNumbers)
-        self.numbers, self.level, self.filled = (
-            numbers,
-            torch.as_tensor(numbers.level, device=zeros.device),
-            numbers.filled,
-        )
+        self.numbers = self.light.parameters.own_as(IsosurfaceNumbers)
+        self.level = torch.as_tensor(self.numbers.level, device=zeros.device)
+        self.filled = self.numbers.filled
         self.is_hit = torch.zeros_like(zeros, dtype=torch.bool)
         self.last_value, self.last_end, self.share = zeros, zeros - INF, zeros
 
@@ -278,25 +275,18 @@ def shade_rays(
     walk = Walk.enter(rays, arguments, twin.bricks)
     beam, channel = walk.intervals.beam, walk.channel
     columns = (rays.origin_r3, rays.direction_r3, beam.moved, arguments.place_33[1])
-    light = Light(
-        ShadeParameters.read(parameter_54),
-        channel.other(shading.normal_bzyxc, shading.normal_tnc, 0),
-        *(column.to(beam.first) for column in columns),
-    )
+    normals = channel.other(shading.normal_bzyxc, shading.normal_tnc, 0)
+    rounded = (column.to(beam.first) for column in columns)
+    light = Light(ShadeParameters.read(parameter_54), normals, *rounded)
     shadows = Shadows(walk, light.cube, arguments.cone_scale)
     other = channel.other(shading.other_bzyxc, shading.other_tnc, shading.other_component)
     features = beam.first.new_zeros((len(beam.first), shading.features))
-    shader = twin.begin(
-        *(rays, arguments, walk, light, other, features),
-        shadows if is_shadowed else None,
-    )
+    fields = (light, other, features, shadows if is_shadowed else None)
+    shader = twin.begin(rays, arguments, walk, *fields)
     walk.follow(shader)
     shader.done(walk)
-    return (
-        *shader.sum.hits(beam),
-        *(walk.samples + shadows.samples, walk.missed | shadows.missed),
-        *(unit(shader.normal), shader.features),
-    )
+    samples, missed = walk.samples + shadows.samples, walk.missed | shadows.missed
+    return *shader.sum.hits(beam), samples, missed, unit(shader.normal), shader.features
 
 
 def _with_length(rows: Tensor, lengths: Tensor) -> Tensor:

@@ -1,10 +1,11 @@
-"""Part of the torch twin: shaders that read colours of voxels, stored or filtered, as in
-csrc/shaders/stored_color.h and, lit, in shaders.h.
+"""Part of the torch twin: stored and filtered colours, as in csrc/shaders, stored_color.h and
+shaders.h.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -90,9 +91,7 @@ class Filtered(Lit):
         self.add_by_function(piece, probe, mask & ~has_colors)
         if not (mask & has_colors).any():
             return
-        contribution = probe.blend(
-            piece.middle, lambda holder: self.contribution(piece, probe, holder)
-        )
+        contribution = probe.blend(piece.middle, partial(self.contribution, piece, probe))
         self.add_contribution(contribution, piece, mask & has_colors)
 
     def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
@@ -111,17 +110,16 @@ class Filtered(Lit):
 
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 4) premultiplied colours and alphas of intervals, from one of the nodes."""
-        row = self.function_row(piece, probe, holder)
+        row = self.function_row(piece, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
         color, alpha, scale = self.seen_colors(self.stored_numbers(piece, holder), piece, holder)
         colors = torch.cat((color[:, :3] * scale[:, None], alpha[:, None]), 1)
         colors = torch.where((scale > 0)[:, None], colors, 0.0)
         return torch.where(self.has_colors(holder)[:, None], colors, row)
 
-    def function_row(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+    def function_row(self, piece: Piece, holder: Holder) -> Tensor:
         """Returns (r, 4) the transfer function's rows for one node's values."""
-        value = self.channel.sample(holder, piece.middle)
-        return self.transfer.interval(value, piece)
+        return self.transfer.interval(self.channel.sample(holder, piece.middle), piece)
 
     def stored_numbers(self, piece: Piece, holder: Holder) -> Tensor:
         """Returns (r, c) all numbers of a node's filtered colours; 0 where it has none."""
@@ -152,15 +150,14 @@ class FilteredLit(Filtered):
         self.lit(self.rgba(piece, probe), piece, probe, mask)
 
     def add_contribution(self, contribution: Tensor, piece: Piece, mask: Tensor) -> None:
-        clear, shown = self.sum.clear[:, None], mask & (contribution[:, 3] > 0)
-        normal = self.normal + clear * contribution[:, 4:]
-        self.normal = torch.where(shown[:, None], normal, self.normal)
+        shown = mask & (contribution[:, 3] > 0)
+        self.add_normal(self.sum.clear[:, None] * contribution[:, 4:], shown)
         super().add_contribution(contribution, piece, mask)
 
     def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 7): the result of `Filtered.contribution`, lit, and normals times alpha."""
         t, light = piece.middle, self.light
-        row = self.function_row(piece, probe, holder)
+        row = self.function_row(piece, holder)
         normal = light.to_eye(probe.slope(holder, t, light.cube))
         color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
         by_function = torch.cat((color * alpha, alpha, normal * alpha), 1)
@@ -191,9 +188,8 @@ class FilteredLit(Filtered):
             column = [m[i] for i in ((0, 1, 2), (1, 3, 4), (2, 4, 5))[axis]]
             weight, total, axial = d * d, m[0] + m[3] + m[5], column[axis]
             valid = (total > 0) & (axial > 0)
-            scale = (
-                sqrt_exact(torch.where(valid, total, 0.0) / torch.where(valid, axial, 1.0)) * weight
-            )
+            ratio = torch.where(valid, total, 0.0) / torch.where(valid, axial, 1.0)
+            scale = sqrt_exact(ratio) * weight
             signed_scale = torch.where(against, scale, -scale)[:, None]
             mean = mean + weight[:, None] * torch.stack(m, 1)
             front = front + signed_scale * torch.stack(column, 1)

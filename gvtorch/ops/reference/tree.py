@@ -100,24 +100,15 @@ class Tree:
     def __init__(self, args: TraceArguments) -> None:
         self.arguments, self.levels = args, Levels(args, args.table_lm4.dtype)
         # A word that names a tile or slot beyond the pool counts as absent.
-        child, brick, tiles, bricks = (
-            args.child_tn,
-            args.brick_tn,
-            len(args.child_tn),
-            len(args.bricks_bzyxc),
-        )
-        self.child_n = torch.where(child < tiles, child, ABSENT).view(-1)
-        self.brick_n = torch.where(brick < bricks, brick, ABSENT).view(-1)
+        child, brick = args.child_tn, args.brick_tn
+        self.child_n = torch.where(child < len(child), child, ABSENT).view(-1)
+        self.brick_n = torch.where(brick < len(args.bricks_bzyxc), brick, ABSENT).view(-1)
         self.request_n, self.per_tile = args.request_tn.view(-1), args.child_tn.shape[1]
 
-    def descend(
-        self, finest: Tensor, wanted_r: Tensor, hides: Callable[[Tensor], Tensor]
-    ) -> Descent:
-        """Descends from the root to the wanted depth, or as far as tiles exist and something is
-        seen; stamps the tiles.
-        """
+    def descend(self, finest: Tensor, wanted: Tensor, hides: Callable[[Tensor], Tensor]) -> Descent:
+        """Descends to the wanted depth, or as far as tiles exist and are seen; stamps the tiles."""
         args, n = self.arguments, self.levels.branching
-        node, depth = torch.full_like(wanted_r, args.root), torch.zeros_like(wanted_r)
+        node, depth = torch.full_like(wanted, args.root), torch.zeros_like(wanted)
         absent = torch.full_like(node, -1)
         descent = Descent(node, depth, absent, hides(node), absent, depth, absent, depth)
         active = torch.ones_like(node, dtype=torch.bool)
@@ -126,12 +117,12 @@ class Tree:
             has_data = active & (self.brick_n[descent.node] != ABSENT)
             descent.fine = torch.where(has_data, descent.node, descent.fine)
             descent.fine_depth = torch.where(has_data, descent.depth, descent.fine_depth)
-            above_wanted = has_data & (descent.depth < wanted_r)
+            above_wanted = has_data & (descent.depth < wanted)
             descent.coarse = torch.where(above_wanted, descent.node, descent.coarse)
             descent.coarse_depth = torch.where(above_wanted, descent.depth, descent.coarse_depth)
 
             tile = self.child_n[descent.node].to(torch.int64)
-            active = active & (descent.depth < wanted_r) & (tile >= 0) & ~descent.hidden
+            active = active & (descent.depth < wanted) & (tile >= 0) & ~descent.hidden
             if not active.any():
                 return descent
             x, y, z = (self.levels.cells(finest, descent.depth + active) % n).unbind(1)
@@ -153,22 +144,15 @@ class Tree:
         level by level; returns (r,) bool: the ray made a request.
         """
         by_level, absent = self.arguments.by_level, self.brick_n[descent.node] == ABSENT
-        deeper = (descent.depth < wanted) & (self.child_n[descent.node] == ABSENT)
+        node, depth = descent.node, descent.depth
+        deeper = (depth < wanted) & (self.child_n[node] == ABSENT)
         needs_tile = visible & deeper & ~(by_level & absent)
         needs_brick = visible & absent & (by_level | ~deeper | (descent.fine < 0))
         parent = descent.parent.clamp(min=0)
-        needs_parent = (
-            visible & blends & (descent.depth == wanted) & (self.brick_n[parent] == ABSENT)
-        )
-        self.request(
-            descent.node[needs_tile], descent.depth[needs_tile], cone[needs_tile], REQUEST_SUBDIVIDE
-        )
-        self.request(
-            descent.node[needs_brick], descent.depth[needs_brick], cone[needs_brick], REQUEST_LOAD
-        )
-        self.request(
-            parent[needs_parent], descent.depth[needs_parent] - 1, cone[needs_parent], REQUEST_LOAD
-        )
+        needs_parent = visible & blends & (depth == wanted) & (self.brick_n[parent] == ABSENT)
+        self.request(needs_tile, node, depth, cone, REQUEST_SUBDIVIDE)
+        self.request(needs_brick, node, depth, cone, REQUEST_LOAD)
+        self.request(needs_parent, parent, depth - 1, cone, REQUEST_LOAD)
         return needs_tile | needs_brick | needs_parent
 
     def stamp(self, brick: Tensor) -> None:
@@ -176,13 +160,13 @@ class Tree:
         args = self.arguments
         args.stamp_b[brick[brick >= 0]] = args.frame_1[0]
 
-    def request(self, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
-        """Joins requests into the request words: kinds by OR, priorities by maximum. A priority is
-        the width of one voxel on the screen, in 1/16 pixel, up to 128 pixels.
+    def request(self, mask: Tensor, node: Tensor, depth: Tensor, cone: Tensor, kind: int) -> None:
+        """Joins requests, where `mask` (r,) is true, into words: kinds by OR, priorities by
+        maximum. A priority is a voxel's width on the screen in 1/16 pixel, up to 128 pixels.
         """
-        if not len(node):
+        if not mask.any():
             return
-        voxel = self.levels.voxel_d[depth]
+        node, cone, voxel = node[mask], cone[mask], self.levels.voxel_d[depth[mask]]
         priority = torch.where(cone > 0, voxel / cone * 16, REQUEST_PRIORITY)
         priority = torch.where(priority < REQUEST_PRIORITY, priority, REQUEST_PRIORITY)
         requested, inverse = torch.unique(node, return_inverse=True)
@@ -232,17 +216,12 @@ class ChannelBricks:
         constant_rc = self.constant_nc[holder.node.clamp(min=0)].to(real)
         return torch.where(holder.node[:, None] >= 0, constant_rc, 0.0)
 
-    @property
-    def single(self) -> ChannelBricks:
-        """The channel without the numbers that are not read."""
-        c = slice(self.component, self.component + 1)
-        return ChannelBricks(
-            self.bricks_bzyxc[..., c], self.constant_nc[:, c], self.range_n2c, self.border, 0
-        )
-
     def sample(self, holder: Holder, t: Tensor, shift: Tensor | float = 0.0) -> Tensor:
         """Returns (r,) values of the component, or (..., r); see `samples`."""
-        return self.single.samples(holder, t, shift)[..., 0]
+        c = slice(self.component, self.component + 1)
+        bricks, constants = self.bricks_bzyxc[..., c], self.constant_nc[:, c]
+        single = replace(self, bricks_bzyxc=bricks, constant_nc=constants)
+        return single.samples(holder, t, shift)[..., 0]
 
     def samples(self, holder: Holder, t: Tensor, shift: Tensor | float = 0.0) -> Tensor:
         """Returns (r, c) trilinear values at distances t (r,); the node's constants where it has no

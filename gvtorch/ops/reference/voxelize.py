@@ -148,14 +148,11 @@ def _weights(position_p3: Tensor, corner_p33: Tensor) -> Tensor:
     second = ~first & (gaps[1] <= gaps[2])
     third, zero = ~first & ~second, torch.zeros_like(gaps[0])
     edge_weights = zero[:, None].expand(-1, 3)
-    for index, (is_nearest, t) in enumerate(
-        zip((first, second, third), edge_positions, strict=True)
-    ):
-        corner_weights = [zero, zero, zero]
+    for index, is_nearest in enumerate((first, second, third)):
+        corner_weights, t = [zero, zero, zero], edge_positions[index]
         corner_weights[index], corner_weights[(index + 1) % 3] = 1 - t, t
-        edge_weights = torch.where(
-            is_nearest[:, None], torch.stack(corner_weights, 1), edge_weights
-        )
+        weights = torch.stack(corner_weights, 1)
+        edge_weights = torch.where(is_nearest[:, None], weights, edge_weights)
     return torch.where(inside[:, None], inside_weights, edge_weights)
 
 
