@@ -158,15 +158,10 @@ def _encode_object(value: Any) -> dict[str, Any]:
 
 
 def _argument(owner: Any, name: str) -> Any:
-    reader = next(
-        (
-            _ARGUMENT_READERS[base.__name__, name]
-            for base in type(owner).__mro__
-            if (base.__name__, name) in _ARGUMENT_READERS
-        ),
-        None,
-    )
-    return getattr(owner, name) if reader is None else reader(owner)
+    for base in type(owner).__mro__:
+        if reader := _ARGUMENT_READERS.get((base.__name__, name)):
+            return reader(owner)
+    return getattr(owner, name)
 
 
 def _kept_marker(value: Any) -> dict[str, str]:
@@ -196,8 +191,9 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
                 f"{path}: JSON can't represent what was here: {content['kept']!r:.200}"
             )
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    named = content.get("kind") if isinstance(content, dict) else None
     problems = []
-    for choice in sorted(choices, key=lambda choice: not _is_named(choice, content)):
+    for choice in sorted(choices, key=lambda choice: getattr(choice, "__name__", "") != named):
         try:
             return _decode_type(path, choice, content, current, depth)
         except _WrongType as error:
@@ -208,11 +204,6 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
 
 class _WrongType(Exception):
     """The content is of another type."""
-
-
-def _is_named(hint: Any, content: Any) -> bool:
-    """Returns whether a class is the one that the content names."""
-    return isinstance(content, dict) and getattr(hint, "__name__", "") == content.get("kind")
 
 
 def _decode_type(path: str, hint: Any, content: Any, current: Any, depth: int) -> Any:
@@ -410,9 +401,8 @@ def _slider_range(owner: str, name: str) -> tuple[float, float] | None:
     names = [base.__name__ for base in kind.__mro__] if kind is not None else [owner]
     if kind is not None and issubclass(kind, Shader):
         names.append("Lit")
-    return next(
-        (SLIDERS[class_name, name] for class_name in names if (class_name, name) in SLIDERS), None
-    )
+    ranges = (SLIDERS.get((class_name, name)) for class_name in names)
+    return next(filter(None, ranges), None)
 
 
 def describe_kind(kind: type) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import socket
 import threading
 from collections.abc import Iterable
 from concurrent.futures import Future
+from functools import partial
 from importlib import resources
 from typing import Any
 from urllib.parse import urlencode, urlsplit
@@ -153,13 +154,8 @@ class Server:
             await runner.cleanup()
 
     def _application(self) -> Any:
-        web = self._web
-
-        @web.middleware
-        async def guard(request: Any, handler: Any) -> Any:
-            return await self._guard_request(request, handler)
-
-        app = web.Application(middlewares=[guard])
+        guard = partial(self._guard_request)  # aiohttp marks it, which a method does not allow
+        app = self._web.Application(middlewares=[self._web.middleware(guard)])
         app.router.add_get("/", self._serve_page)
         app.router.add_get("/ws", self._serve_socket)
         app.router.add_get("/{name}", self._serve_page)
