@@ -49,7 +49,6 @@ class Client:
     """
 
     def __init__(self, number: int, send: Send, eye: Eye) -> None:
-        """Takes a function that sends a text or bytes to the page."""
         self.number, self._send = number, send
         self.eye, self.size, self.rate = eye, (0, 0), 25.0
         self.follows: int | None = None
@@ -105,7 +104,6 @@ class Client:
     # The renderer's side.
 
     def move(self, eye: Eye, moving: bool, sent: float) -> None:
-        """Sets the camera."""
         self.eye, self._moving, self._finished = eye, moving, False
         self._move_time, self._move_clock = time.monotonic(), sent
 
@@ -292,8 +290,7 @@ class Client:
         if not distance < float("inf"):
             return None
         rays = self._camera.rays(rows=(row, row + 1))
-        position = rays.origin[column] + distance * rays.direction[column]
-        return position.tolist()
+        return (rays.origin[column] + distance * rays.direction[column]).tolist()
 
 
 def image_file(picture: Picture, kind: str, **options: Any) -> bytes:

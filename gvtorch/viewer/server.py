@@ -121,7 +121,6 @@ class Server:
         return f"http://{host}:{self.port}/{query}"
 
     def close(self) -> None:
-        """Stops the server."""
         if self._loop.is_running():
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(timeout=10)
