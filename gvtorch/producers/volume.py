@@ -190,9 +190,8 @@ def _grid_offsets(sizes: Sequence[Sequence[int]]) -> Tensor:
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
     """Returns (n, s, s, s, c): the bricks of a channel, by level and then z, y, x."""
-    node_positions = [
-        torch.cartesian_prod(*map(torch.arange, level.grid)) for level in levels[: len(values)]
-    ]
+    grids = (level.grid for level in levels[: len(values)])
+    node_positions = [torch.cartesian_prod(*map(torch.arange, grid)) for grid in grids]
     shape = (sum(map(len, node_positions)), *(layout.side,) * 3, values[0].shape[3])
     bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0
     for level, zyx in zip(values, node_positions, strict=True):
