@@ -256,6 +256,19 @@ def test_every_bit_is_as_it_was(backend, group):
     assert not wrong, f"{len(wrong)} of {tried} scenes changed:\n" + "\n".join(wrong)
 
 
+def test_the_default_device_of_torch_changes_no_bit(backend):
+    """A program may make its own tensors elsewhere."""
+    seeds = [seed for seed in range(0, SCENES, 6) if promised(settings(seed), backend)]
+    torch.set_default_device("meta")
+    try:
+        actual = {seed: hashes(seed, backend) for seed in seeds}
+    finally:
+        torch.set_default_device(None)
+    for seed in seeds:
+        for part in {"picture", "counts"} & actual[seed].keys():
+            assert actual[seed][part] == golden()["scenes"][seed][part], described(settings(seed))
+
+
 def test_every_setting_is_drawn():
     """Every option occurs at least a few times."""
     scenes = [settings(seed) for seed in range(SCENES)]

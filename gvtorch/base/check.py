@@ -438,7 +438,7 @@ def reals(context: str, name: str, value: Any, shape: tuple[int, ...] | None = N
     if _is_complex(value):
         raise ValueError(f"{context}: {name} must be real numbers, got {quoted(value)}")
     try:
-        numbers = torch.as_tensor(value, dtype=torch.float64).detach().cpu().clone()
+        numbers = torch.as_tensor(value, dtype=torch.float64, device="cpu").detach().cpu().clone()
     except (TypeError, ValueError, RuntimeError, OverflowError):
         raise ValueError(f"{context}: {name} must be numbers, got {quoted(value)}") from None
     if shape is not None and numbers.shape != shape:

@@ -52,7 +52,8 @@ def from_grid(values: np.ndarray | Tensor, dtype: torch.dtype) -> Tensor:
     """Converts a grid back into a tensor of the dtype that `as_grid` took."""
     import torch
 
-    return torch.as_tensor(values).to(dtype)
+    tensor = values if isinstance(values, torch.Tensor) else torch.from_numpy(values)
+    return tensor.to(dtype)
 
 
 def round_array(values: np.ndarray, dtype: np.dtype) -> np.ndarray:

@@ -21,9 +21,9 @@ def lru(record: Record) -> None:
     if not record.wants(case):
         return
     generator = torch.Generator().manual_seed(1)
-    stamp = torch.randint(0, 99, (slots,), generator=generator, dtype=torch.int32)
+    stamp = torch.randint(0, 99, (slots,), generator=generator, dtype=torch.int32, device="cpu")
     order = torch.sort(stamp, stable=True).indices.to(torch.int32).to(device)
-    stamp[torch.randperm(slots, generator=generator)[: slots // 2]] = 100
+    stamp[torch.randperm(slots, generator=generator, device="cpu")[: slots // 2]] = 100
     stamp = stamp.to(device)
     frame = torch.tensor([100], dtype=torch.int32, device=device)
     calls = 20 if device.type == "cuda" else 1
@@ -50,8 +50,10 @@ def compact(record: Record) -> None:
     case = f"{nodes:,} nodes, {_REQUESTS:,} requests"
     if not record.wants(case):
         return
-    requesting = torch.randperm(nodes, generator=torch.Generator().manual_seed(2))[:_REQUESTS]
-    words = torch.zeros(nodes, dtype=torch.int16)
+    requesting = torch.randperm(nodes, generator=torch.Generator().manual_seed(2), device="cpu")[
+        :_REQUESTS
+    ]
+    words = torch.zeros(nodes, dtype=torch.int16, device="cpu")
     words[requesting] = REQUEST_LOAD | 77
     words = words.view(-1, 8).to(settings.device)
     count = 16 if settings.device.type == "cuda" else 4

@@ -47,7 +47,7 @@ def _measure(record: Record, context: Any, name: str, exchanges: list[gl.Exchang
     settings, (width, height) = record.settings, (exchanges[0].width, exchanges[0].height)
     gl_dtype, dtype = _FORMATS[name]
     generator = torch.Generator().manual_seed(1)
-    values = torch.rand(height, width, 5, generator=generator).to(settings.device)
+    values = torch.rand(height, width, 5, generator=generator, device="cpu").to(settings.device)
     color, depth = values[..., :4] * (255 if dtype == torch.uint8 else 1), values[..., 4:]
     color = color.to(dtype)
     texture = context.texture((width, height), 4, dtype=gl_dtype)

@@ -66,7 +66,7 @@ def deep(record: Record) -> None:
     for view_name, offset in (("from above", (0.0, 0.01, 0.4)), ("obliquely", (0.0, -0.28, 0.28))):
         eye = [t + patch * o for t, o in zip(target, offset, strict=True)]
         camera = Camera.look_at(eye, target, (0, 1, 0), size[1] / 36, *size)  # pixel-sized voxels
-        first_picture, first_median = torch.empty(0), 0.0
+        first_picture, first_median = torch.empty(0, device="cpu"), 0.0
         for side, box in boxes.items():
             case, who = f"shell, {view_name}, {size[0]}x{size[1]}", f"a tree of {side}^3"
             if not record.wants(case):
@@ -242,7 +242,11 @@ class ReadyProducer(Producer):
     def __init__(self, side: int, pinned: bool) -> None:
         """Makes as many rows as one frame may request."""
         super().__init__(side, channels={"value": Channel(torch.uint8)})
-        rows = torch.arange(_FRAME_ROWS, dtype=torch.int32).remainder(251).to(torch.uint8)
+        rows = (
+            torch.arange(_FRAME_ROWS, dtype=torch.int32, device="cpu")
+            .remainder(251)
+            .to(torch.uint8)
+        )
         bricks = rows[:, None, None, None, None].expand(_FRAME_ROWS, 10, 10, 10, 1).contiguous()
         self.bricks = bricks.pin_memory() if pinned else bricks
 
@@ -326,7 +330,7 @@ def _clock_copy(record: Record, pinned: bool) -> tuple[Timing, float, int]:
     """Returns the time, the bytes per second, and the bytes of one copy from the host."""
     settings = record.settings
     size = 1 << (20 if settings.quick else 28)
-    source = torch.ones(size, dtype=torch.uint8)
+    source = torch.ones(size, dtype=torch.uint8, device="cpu")
     source = source.pin_memory() if pinned else source
     target = torch.zeros(size, dtype=torch.uint8, device=settings.device)
     timing = clock(lambda: target.copy_(source, non_blocking=pinned), settings)

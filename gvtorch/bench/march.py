@@ -88,7 +88,7 @@ def calls(record: Record) -> None:
     if not record.wants(case):
         return
     settings.tell(case)
-    angles = torch.linspace(0, 360, count + 1, dtype=torch.float64)[:-1]
+    angles = torch.linspace(0, 360, count + 1, dtype=torch.float64, device="cpu")[:-1]
     cameras = Camera.orbit(angles, 20, 2.0, 30, small_side, small_side).placed(scene.box)
     single_cameras = [cameras[n] for n in range(count)]
     one_batch = partial(render, tree, cameras, scene.shader)
@@ -150,7 +150,7 @@ def _compare(
     """Adds a row for each level of detail, then one for each peer."""
     settings, case = record.settings, _case_name(scene.name, size)
     device, camera = settings.device, scene.camera(*size)
-    finest = torch.empty(0)
+    finest = torch.empty(0, device="cpu")
     for lod in lods:
         who = "gvtorch" if lod == "finest" else f"gvtorch {lod}"
         settings.tell(f"{case}: {who}")

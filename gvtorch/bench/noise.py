@@ -20,7 +20,7 @@ def noise(record: Record) -> None:
     """Evaluates noise at random points in a cube of 100 cells a side."""
     settings = record.settings
     count = {"cpu": 1 << 20, "cuda": 1 << 25}[settings.device.type] >> (8 * settings.quick)
-    points = 100 * torch.rand((count, 3), generator=torch.Generator().manual_seed(5))
+    points = 100 * torch.rand((count, 3), generator=torch.Generator().manual_seed(5), device="cpu")
     case = f"{count:,} points"
     if record.wants(case):
         _measure_perlin(record, case, points)

@@ -54,7 +54,7 @@ def library() -> dict[str, Producer]:
     ball, lace = sdf.Sphere(0.9), sdf.Shell(sdf.Gyroid(0.46), 0.035)
     octaves = noise.SplineSum(frequency=4.0, octaves=8)
     generator = torch.Generator().manual_seed(5)
-    points = torch.randn((1_000_000, 3), generator=generator).double()
+    points = torch.randn((1_000_000, 3), generator=generator, device="cpu").double()
     return {
         "rings": Ripples(),
         "Mandelbulb": FieldProducer(bulb, _SIDE),
@@ -100,7 +100,7 @@ def random_nodes(producer: Producer, max_count: int, device: torch.device) -> No
     side = -(-min(producer.extent) // 8)
     data_locs: list[Tensor] = []
     for _ in range(64):
-        loc = torch.randint(0, side, (8 * max_count, 4), generator=generator)
+        loc = torch.randint(0, side, (8 * max_count, 4), generator=generator, device="cpu")
         loc[:, 3] = layout.depth
         loc = loc.to(device)
         regions: Any = producer.classify(Nodes(loc, layout))

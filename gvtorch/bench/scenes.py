@@ -33,7 +33,7 @@ class BenchScene:
     @property
     def box(self) -> Tensor:
         """(2, 3) float64 world corners."""
-        high = torch.tensor(self.volume.extent, dtype=torch.float64) - 0.5
+        high = torch.tensor(self.volume.extent, dtype=torch.float64, device="cpu") - 0.5
         return torch.stack((torch.full_like(high, -0.5), high))
 
     def camera(self, width: int, height: int) -> Camera:
@@ -43,7 +43,7 @@ class BenchScene:
 
 def _grid(side: int) -> tuple[Tensor, Tensor, Tensor]:
     """Returns z, y, x in [-1, 1] of a cube of voxels."""
-    axis = torch.linspace(-1, 1, side)
+    axis = torch.linspace(-1, 1, side, device="cpu")
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     return z, y, x
 

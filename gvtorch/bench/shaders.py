@@ -248,6 +248,6 @@ def _extra_channels(scene: BenchScene) -> dict[str, Volume]:
     normal = torch.nn.functional.normalize(torch.stack(torch.gradient(value)[::-1], -1), dim=-1)
     color = torch.from_numpy(scene.shader(value.numpy()))
     color[..., :3] *= color[..., 3:] > 0
-    numbers = (value[..., None] * torch.arange(1.0, _COMPONENTS + 1)).remainder(256)
+    numbers = (value[..., None] * torch.arange(1.0, _COMPONENTS + 1, device="cpu")).remainder(256)
     channels = {"normal": 255 * (0.5 + 0.5 * normal), "rgba": 255 * color, "numbers": numbers}
     return {name: Volume(data.round().to(torch.uint8)) for name, data in channels.items()}

@@ -30,7 +30,7 @@ class LRU:
         """Starts with slots `locked` to `capacity`, all free."""
         size, on_host = capacity - locked, device.type == "cpu"
         self._memory = torch.empty(size + size // 512 * on_host, dtype=torch.int32, device=device)
-        self.order = torch.arange(locked, capacity, out=self._memory[:size])
+        self.order = torch.arange(locked, capacity, out=self._memory[:size], device=device)
         self.unused = size
         self.fresh = size if on_host else 0
 
@@ -199,7 +199,9 @@ class Cache:
         sizes = (nodes.capacity, bricks.capacity)
         for group, capacity in zip(self.lru.values(), sizes, strict=True):
             order = torch.cat([lru.order for lru in group]).sort().values
-            if not torch.equal(order, torch.arange(capacity - len(order), capacity).to(order)):
+            if not torch.equal(
+                order, torch.arange(capacity - len(order), capacity, device=order.device).to(order)
+            ):
                 raise ValueError("Cache: the order of use is no permutation of the slots")
         linked = (nodes.parent_t >= 0) | nodes.shared_t
         linked[: len(self.finest)] = True  # the roots

@@ -112,8 +112,10 @@ class Camera:
         self.viewmats, self.Ks = view.reshape(-1, 4, 4), K.reshape(-1, 3, 3)
         check_matrices(self.viewmats, self.Ks)
         angle = check.number("Camera", "max_angle", max_angle, low=0, high=180, open_low=True)
-        self.max_angle = torch.full((len(self),), math.radians(angle), dtype=torch.float64)
-        self.radial_coeffs = torch.zeros(len(self), 4, dtype=torch.float64)
+        self.max_angle = torch.full(
+            (len(self),), math.radians(angle), dtype=torch.float64, device="cpu"
+        )
+        self.radial_coeffs = torch.zeros(len(self), 4, dtype=torch.float64, device="cpu")
         if radial_coeffs is not None:
             self._distort(check.reals("Camera", "radial_coeffs", radial_coeffs))
         self.distorted = bool((self.radial_coeffs != 0).any())
@@ -126,7 +128,9 @@ class Camera:
             raise ValueError(f"Camera: radial_coeffs must be (4,) or ({count}, 4), got {shape}")
         self.radial_coeffs = coefficients.expand(count, 4).contiguous()
         rising = [last_rising_angle(row) for row in self.radial_coeffs]
-        self.max_angle = torch.minimum(self.max_angle, torch.tensor(rising, dtype=torch.float64))
+        self.max_angle = torch.minimum(
+            self.max_angle, torch.tensor(rising, dtype=torch.float64, device="cpu")
+        )
 
     @classmethod
     def orbit(
@@ -282,10 +286,10 @@ class Camera:
 
         if self.model != "pinhole":
             raise ValueError(f"Camera.to_kornia: the camera must be a pinhole, is {self.model!r}")
-        intrinsics = torch.eye(4, dtype=torch.float64).repeat(len(self), 1, 1)
+        intrinsics = torch.eye(4, dtype=torch.float64, device="cpu").repeat(len(self), 1, 1)
         intrinsics[:, :3, :3] = self.Ks
         intrinsics[:, :2, 2] -= 0.5
-        size = torch.ones(len(self), dtype=torch.float64)
+        size = torch.ones(len(self), dtype=torch.float64, device="cpu")
         return PinholeCamera(intrinsics, self.viewmats, self.height * size, self.width * size)
 
     def __len__(self) -> int:
@@ -371,7 +375,7 @@ class Camera:
         of the pixels, with another `sample` number if given.
         """
         Ks = self.Ks.clone()
-        Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64)
+        Ks[:, :2, 2] -= torch.tensor([dx, dy], dtype=torch.float64, device="cpu")
         return self._copy_with(Ks=Ks, sample=self.sample if sample is None else sample)
 
     def strip(self, first: int, end: int) -> Camera:
@@ -484,7 +488,9 @@ def _aimed(
     check.integer(context, "width", width, low=1, high=MAX_PICTURE_SIDE)
     check.integer(context, "height", height, low=1, high=MAX_PICTURE_SIDE)
     fx, fy = camera_model.focal(math.radians(fov), width, height)
-    Ks = torch.tensor([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64)
+    Ks = torch.tensor(
+        [[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], dtype=torch.float64, device="cpu"
+    )
     if camera_model.parallel:
         Ks = Ks.repeat(*distance.shape, 1, 1)
         Ks[..., (0, 1), (0, 1)] /= distance[..., None]

@@ -32,7 +32,9 @@ from .camera import Camera
 from .motion import quaternion_of, rotation_of
 from .poses import Coordinates
 
-_FLIP = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))  # y down to y up
+_FLIP = torch.diag(
+    torch.tensor([1.0, -1, -1, 1], dtype=torch.float64, device="cpu")
+)  # y down to y up
 _PVCC_PROPERTIES = (
     ("CameraPosition", 3),
     ("CameraFocalPoint", 3),
@@ -215,7 +217,7 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
     for number, frame in enumerate(content["frames"]):
         fields = {**content, **frame}
         pose = check.reals(f"frame {number}", "pose", fields["transform_matrix"], (4, 4)) @ _FLIP
-        view = torch.eye(4, dtype=torch.float64)
+        view = torch.eye(4, dtype=torch.float64, device="cpu")
         view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
         x, y = (int(fields.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
         if not x or not y:
@@ -248,7 +250,7 @@ def _camera_of_lens(
     fx = lens["fx"]
     fy = fx if lens.get("fy") is None else lens["fy"]
     cx, cy = lens.get("cx", size[0] / 2), lens.get("cy", size[1] / 2)
-    Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64, device="cpu")
     distortion = [float(lens.get(name) or 0) for name in _DISTORTIONS]
     if not any(distortion):
         return Camera(view, Ks, *size, model="fisheye" if model == _FISHEYE else "pinhole")
@@ -306,7 +308,7 @@ def _read_colmap(path: Path) -> dict[str, Camera]:
     for line in _read_lines(path / "images.txt", every=2):
         _, *numbers, number, name = line.split(maxsplit=9)
         pose = check.reals(f"image {name}", "pose", [float(n) for n in numbers], (7,))
-        view = torch.eye(4, dtype=torch.float64)
+        view = torch.eye(4, dtype=torch.float64, device="cpu")
         view[:3, :3], view[:3, 3] = rotation_of(pose[:4].tolist()), pose[4:]
         model, lens, size = lenses[number]
         cameras[name] = _camera_of_lens(model, view, lens, size)

@@ -82,7 +82,7 @@ def exponential(step: Tensor) -> Tensor:
     turning (3), shift (3).
     """
     scaled, integral = _flow(step)
-    pose = torch.eye(4, dtype=step.dtype)
+    pose = torch.eye(4, dtype=step.dtype, device="cpu")
     pose[:3, :3], pose[:3, 3] = scaled, integral @ step[4:]
     return pose
 
@@ -102,7 +102,7 @@ def _flow(step: Tensor) -> tuple[Tensor, Tensor]:
     growth, angle = float(step[0]), float(step[1:4].norm())
     x, y, z = (step[1:4] / angle if angle > 0 else step[1:4]).tolist()
     cross = step.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    powers = torch.stack((torch.eye(3, dtype=step.dtype), cross, cross @ cross))
+    powers = torch.stack((torch.eye(3, dtype=step.dtype, device="cpu"), cross, cross @ cross))
     scale, rate = math.exp(growth), complex(growth, angle)
     exp_minus_1 = complex(
         math.expm1(growth) * math.cos(angle) - 2 * math.sin(angle / 2) ** 2,
@@ -153,4 +153,4 @@ def rotation_of(quaternion: Sequence[float]) -> Tensor:
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor(rows, dtype=torch.float64, device="cpu")

@@ -62,7 +62,7 @@ class CameraPath:
             [check.triple("CameraPath", name, value) for value in lists[name]]
             for name in ("eye", "target", "up")
         ]
-        parts = [torch.tensor(part, dtype=torch.float64) for part in (*rows, angles)]
+        parts = [torch.tensor(part, dtype=torch.float64, device="cpu") for part in (*rows, angles)]
         self._keys = torch.cat(parts, 1)  # (k, 10)
 
     @classmethod
@@ -93,7 +93,7 @@ class CameraPath:
         """
         context = "CameraPath.orbit"
         fov = model_of(context, model).fov if fov is None else fov
-        azimuths = azimuth + torch.linspace(0, 360, 37)
+        azimuths = azimuth + torch.linspace(0, 360, 37, dtype=torch.float32, device="cpu")
         if fit_size is not None:
             if distance is not None:
                 raise ValueError(
@@ -162,7 +162,7 @@ class CameraPath:
         position = at * last
         first = min(int(position), max(last - 1, 0))
         t = position - first
-        index = torch.arange(first - 1, first + 3).clamp(0, last)
+        index = torch.arange(first - 1, first + 3, device="cpu").clamp(0, last)
         a, b, c, d = self._keys[index]
         # Cubic through b and c, with the slope at each that of the chord between its neighbours.
         key = b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))

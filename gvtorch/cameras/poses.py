@@ -68,7 +68,7 @@ def batches(context: str, **values: tuple[Any, tuple[int, ...]]) -> list[Tensor]
 def check_matrices(viewmats: Tensor, Ks: Tensor) -> None:
     """Raises ValueError unless these are poses (n, 4, 4) and intrinsics (n, 3, 3)."""
     rotation, bottom = viewmats[:, :3, :3], viewmats.new_tensor([0, 0, 0, 1])
-    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64)).abs().max()
+    error = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device="cpu")).abs().max()
     rotates = error <= 1e-3 and (torch.linalg.det(rotation) >= 0).all()
     last = (viewmats[:, 3] == bottom).all() and (Ks[:, 2] == bottom[1:]).all()
     for wanted, holds in {
@@ -90,8 +90,8 @@ def upward(context: str, up: Up) -> Tensor:
             names = ", ".join(DIRECTIONS)
             raise ValueError(f"{context}: up must be one of {names} or three numbers, got {up!r}")
         axis, sign = divmod(DIRECTIONS.index(up), 2)
-        return torch.eye(3, dtype=torch.float64)[axis] * (1 - 2 * sign)
-    direction = torch.tensor(check.triple(context, "up", up), dtype=torch.float64)
+        return torch.eye(3, dtype=torch.float64, device="cpu")[axis] * (1 - 2 * sign)
+    direction = torch.tensor(check.triple(context, "up", up), dtype=torch.float64, device="cpu")
     if not bool(direction.any()):
         raise ValueError(f"{context}: up must not be zero")
     return direction
@@ -136,7 +136,7 @@ def _pose(eye: Tensor, forward: Tensor, right: Tensor) -> Tensor:
     """Returns (..., 4, 4), world to camera, from a position and two orthonormal directions."""
     down = torch.linalg.cross(forward, right)
     rotation = torch.stack((right, down, forward), dim=-2)
-    view = torch.eye(4, dtype=torch.float64).repeat(*eye.shape[:-1], 1, 1)
+    view = torch.eye(4, dtype=torch.float64, device="cpu").repeat(*eye.shape[:-1], 1, 1)
     view[..., :3, :3] = rotation
     view[..., :3, 3] = -(rotation @ eye[..., None])[..., 0]
     return view

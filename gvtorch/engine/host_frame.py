@@ -323,7 +323,7 @@ class HostFrame(RecordedFrame):
         is_uniform = brick_word != ABSENT
         self._queue(batch, "bricks", rows, {"data": data}, ~is_uniform & ~is_alias)
         zeros = {
-            name: torch.zeros((len(kind), channel.width), dtype=channel.dtype)
+            name: torch.zeros((len(kind), channel.width), dtype=channel.dtype, device="cpu")
             for name, channel in batch.source.producer.channels.items()
         }
         constants = {"constants": {**zeros, **answer.constants}}
@@ -332,7 +332,9 @@ class HostFrame(RecordedFrame):
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
-        bit = torch.full((len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32)
+        bit = torch.full(
+            (len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32, device="cpu"
+        )
         self._queue(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {})
 
     def _queue(

@@ -197,7 +197,7 @@ def valid_part(
             reasons.setdefault(item // batch.per_node, checked.errors[item])
         for index, message in reasons.items():
             fail(batch[index : index + 1], message, None)
-        kept = torch.ones(len(batch), dtype=torch.bool)
+        kept = torch.ones(len(batch), dtype=torch.bool, device="cpu")
         kept[list(reasons)] = False
         items = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
         batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(items)

@@ -215,7 +215,9 @@ class Readback:
         self._numbers, self._event = numbers, None
         self._counts: Counts | None = None
         if numbers.is_cuda:
-            self._numbers = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
+            self._numbers = torch.empty(
+                numbers.shape, dtype=numbers.dtype, pin_memory=True, device="cpu"
+            )
             self._numbers.copy_(numbers, non_blocking=True)
             self._event = torch.cuda.Event()
             self._event.record(torch.cuda.current_stream(numbers.device))

@@ -49,7 +49,8 @@ class UploadQueue:
         self._cuda = device.type == "cuda"
         self._device_buffer = torch.zeros(size, dtype=torch.uint8, device=device)
         self._host_buffers = [
-            torch.zeros(size, dtype=torch.uint8, pin_memory=self._cuda) for _ in range(_BUFFERS)
+            torch.zeros(size, dtype=torch.uint8, pin_memory=self._cuda, device="cpu")
+            for _ in range(_BUFFERS)
         ]
         self.device_tables = _views(self._device_buffer, fields)
         self._host_tables = [_views(buffer, fields) for buffer in self._host_buffers]

@@ -140,7 +140,7 @@ class Field(nn.Module):
         return self._register(name, triple)
 
     def _register(self, name: str, value: Any) -> Tensor:
-        buffer = torch.tensor(value, dtype=torch.float64)
+        buffer = torch.tensor(value, dtype=torch.float64, device="cpu")
         self.register_buffer(name, buffer)
         return buffer
 
@@ -172,7 +172,7 @@ def modules_by_name(context: str, parts: Mapping[str, nn.Module]) -> nn.ModuleDi
 
 def unit_vector(context: str, name: str, value: Sequence[float] | Tensor) -> Tensor:
     """Returns (3,) float64 a user's direction, of length 1; ValueError if it has no length."""
-    vector = torch.tensor(check.triple(context, name, value), dtype=torch.float64)
+    vector = torch.tensor(check.triple(context, name, value), dtype=torch.float64, device="cpu")
     norm = vector.norm()
     if not 0 < float(norm) < math.inf:
         raise ValueError(f"{context}: {name} must have a direction, got {tuple(value)}")

@@ -186,7 +186,7 @@ def _apart(values: Tensor, spacing: Tensor) -> Tensor:
         start_slices = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
         end_slices = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
         difference = (values[tuple(start_slices)] - values[tuple(end_slices)]).abs().amax()
-        distance = length(torch.tensor(step).to(spacing) * spacing)
+        distance = length(spacing.new_tensor(step) * spacing)
         steepest = torch.maximum(steepest, difference.to(torch.float64) / distance)
     is_cubic = bool((spacing == spacing[0]).all())
     return steepest * (1.1282 if is_cubic else math.sqrt(3))

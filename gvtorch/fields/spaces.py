@@ -388,12 +388,16 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
     """
     x, y, z = unit_vector("rotated", "axis", axis).tolist()
     angle = math.radians(check.number("rotated", "degrees", degrees))
-    cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64)
-    matrix = torch.eye(3).double() + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64, device="cpu")
+    matrix = (
+        torch.eye(3, dtype=torch.float64, device="cpu")
+        + math.sin(angle) * cross
+        + (1 - math.cos(angle)) * cross @ cross
+    )
     return Transform(shape, matrix)
 
 
 def scaled(shape: Distance, x: float, y: float | None = None, z: float | None = None) -> Transform:
     """Returns a shape scaled along the axes; y and z are x if left out."""
     sides = [check.number("scaled", "factor", x if n is None else n) for n in (x, y, z)]
-    return Transform(shape, torch.diag(torch.tensor(sides, dtype=torch.float64)))
+    return Transform(shape, torch.diag(torch.tensor(sides, dtype=torch.float64, device="cpu")))

@@ -44,11 +44,11 @@ class Paint:
         area = geometry.area
         unit = 2.0 ** -math.frexp(float(area.max()))[1]  # so that float32 holds them, exactly
         area = (unit * area).to(torch.float32)
-        third = torch.full((len(area), 3), 1 / 3, device=device)
+        third = torch.full((len(area), 3), 1 / 3, dtype=torch.float32, device=device)
         color = self.color(torch.arange(len(area), device=device), third)
         area_fraction = (area / area.sum().clamp(min=1e-30))[:, None]
         self.mean_color = (color * area_fraction).sum(0)
-        sums = torch.zeros(len(material_colors), device=device).index_add_(0, material, area)
+        sums = area.new_zeros(len(material_colors)).index_add_(0, material, area)
         self.main_material = int(sums.argmax())
 
     def color(self, face_p: Tensor, weight_p3: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ class Paint:
 
 def _linear(texture: Tensor) -> Tensor:
     """Returns (h, w, 4) float16 linear RGB and opacity from sRGB bytes (IEC 61966-2-1)."""
-    value = torch.arange(256) / 255
+    value = torch.arange(256, dtype=torch.float32, device="cpu") / 255
     table = torch.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     rgb = table[texture[..., :3].long()]
     return torch.cat((rgb, texture[..., 3:].float() / 255), -1).to(torch.float16)
@@ -84,12 +84,14 @@ def _pack_textures(
     """Returns (n, 4) float16 texels of all textures, row after row, and (m, 3) int64 the first
     texel, height and width of each texture. A missing texture is one white texel.
     """
-    white = torch.ones((1, 1, 4), dtype=torch.float16)
+    white = torch.ones((1, 1, 4), dtype=torch.float16, device="cpu")
     texels: dict[int, Tensor] = {}
     firsts, layouts, parts, total = dict[int, int](), [], [], 0
     for texture in textures:
         if id(texture) not in texels:
-            texels[id(texture)] = white if texture is None else _linear(torch.tensor(texture))
+            texels[id(texture)] = (
+                white if texture is None else _linear(torch.tensor(texture, device="cpu"))
+            )
             firsts[id(texture)] = total
             parts.append(texels[id(texture)].view(-1, 4))
             total += len(parts[-1])
@@ -104,7 +106,7 @@ def _bilinear(texel: Tensor, layout_p3: Tensor, uv: Tensor) -> Tensor:
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     x0, y0 = x.floor(), y.floor()
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-    total = torch.zeros((len(uv), 4), device=uv.device)
+    total = torch.zeros((len(uv), 4), dtype=torch.float32, device=uv.device)
     for dy, wy in ((0, 1 - fy), (1, fy)):
         for dx, wx in ((0, 1 - fx), (1, fx)):
             row, column = (y0 + dy).long() % height, (x0 + dx).long() % width

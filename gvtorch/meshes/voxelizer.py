@@ -141,7 +141,9 @@ class Voxelizer:
         self._wide = self.geometry.largest >= _FLOAT32_VOXELS * self.spacing
         # Shares of solids are exact in voxels of any size.
         self._exact_shares = {"coverage"} == {*channels} and bool(self.geometry.solid.all())
-        sample_offsets = torch.tensor(list(itertools.product(range(_SAMPLES_PER_SIDE), repeat=3)))
+        sample_offsets = torch.tensor(
+            list(itertools.product(range(_SAMPLES_PER_SIDE), repeat=3)), device="cpu"
+        )
         self._sample_offsets = sample_offsets.to(self.device, torch.float64)
         painted = {"color", "normal", "material"} & {*channels}
         self.paint = Paint(mesh, self.geometry) if painted else None
@@ -188,11 +190,11 @@ class Voxelizer:
         shape = (len(inside_k), 1, 1, 1)
         inside = inside_k.view(shape)
         far = Voxelized(
-            distance=torch.full(shape, torch.inf, device=self.device),
+            distance=torch.full(shape, torch.inf, dtype=torch.float32, device=self.device),
             nearest=torch.full(shape, -1, dtype=torch.int32, device=self.device),
             winding=inside.to(torch.int32),
             coverage=inside.to(torch.float32),
-            weight=torch.zeros((*shape, 3), device=self.device),
+            weight=torch.zeros((*shape, 3), dtype=torch.float32, device=self.device),
         )
         voxels = self._channels(far)
         return {name: _to_channel_dtype(name, v)[:, 0, 0, 0] for name, v in voxels.items()}

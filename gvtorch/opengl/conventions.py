@@ -23,7 +23,7 @@ from ..cameras.camera import Camera
 from ..cameras.poses import Coordinates
 from ..pool.staging import upload
 
-_AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64)  # flips y and z
+_AXES = torch.tensor([1, -1, -1, 1], dtype=torch.float64, device="cpu")  # flips y and z
 
 
 class ClipDepth(Enum):
@@ -69,7 +69,7 @@ def matrices(
         far = check.number(context, "far", far, low=near, open_low=True)
     check.instance(context, "clip_depth", clip_depth, ClipDepth)
     (fx, fy), (cx, cy) = camera.Ks[:, (0, 1), (0, 1)].unbind(1), camera.Ks[:, :2, 2].unbind(1)
-    projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64)
+    projection = torch.zeros(len(camera), 4, 4, dtype=torch.float64, device="cpu")
     projection[:, 0, 0], projection[:, 0, 2] = 2 * fx / camera.width, 1 - 2 * cx / camera.width
     projection[:, 1, 1], projection[:, 1, 2] = 2 * fy / camera.height, 2 * cy / camera.height - 1
     ratio = near / far  # 0 for a far plane at infinity

@@ -105,7 +105,8 @@ class Exchange:
         if share and self.reason:
             raise RuntimeError(f"{context}: buffers can't be shared: {self.reason}")
         self.shared = not self.reason
-        self._byte_max = torch.full((1,), 255.0, device=self.device)  # all devices divide alike
+        # A tensor: all devices divide alike.
+        self._byte_max = torch.full((1,), 255.0, dtype=torch.float32, device=self.device)
         transfer_type = _SharedTransfer if self.shared else _HostTransfer
         self._transfers = defaultdict[str, _HostTransfer](
             partial(transfer_type, self._gl, self.device)
@@ -380,7 +381,7 @@ class _HostTransfer:
         """Returns an image; `read` has OpenGL write it to a host address, or to an offset in the
         bound buffer.
         """
-        host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda")
+        host = torch.empty(shape, dtype=dtype, pin_memory=self._device.type == "cuda", device="cpu")
         self._gl.BindBuffer(gl.PIXEL_PACK_BUFFER, 0)
         read(host.data_ptr())
         return host.to(self._device).flip(0)

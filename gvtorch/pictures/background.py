@@ -109,8 +109,10 @@ class Environment(Background):
         if not bool(torch.isfinite(image).all()):
             raise ValueError("Environment: image must be finite, got NaN or infinity")
         self.image = image
-        identity = torch.eye(3, dtype=torch.float64)
-        self.rotation = identity if rotation is None else torch.as_tensor(rotation).to(identity)
+        identity = torch.eye(3, dtype=torch.float64, device="cpu")
+        self.rotation = (
+            identity if rotation is None else torch.as_tensor(rotation, device="cpu").to(identity)
+        )
         if self.rotation.shape != (3, 3) or not torch.allclose(
             self.rotation @ self.rotation.mT, identity, atol=1e-3
         ):

@@ -93,7 +93,7 @@ class N3Tree:
         self.origin = origin
         low = [o - 0.5 * s for o, s in zip(origin, spacing, strict=True)]
         high = [a + n * s for a, n, s in zip(low, extent, spacing, strict=True)]
-        self.box = torch.tensor([low, high], dtype=torch.float64)
+        self.box = torch.tensor([low, high], dtype=torch.float64, device="cpu")
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         self.frame = 0
         self.made_of: dict[str, Any] = {}
@@ -146,8 +146,8 @@ class N3Tree:
         the world, the world size of the root cube, the scene's high corner in tree units.
         """
         if self._place is None or self._place.device != self.device:
-            size = torch.tensor(self.spacing, dtype=torch.float64) * self.side
-            high = torch.tensor(self.extent, dtype=torch.float64) / self.side
+            size = torch.tensor(self.spacing, dtype=torch.float64, device="cpu") * self.side
+            high = torch.tensor(self.extent, dtype=torch.float64, device="cpu") / self.side
             self._place = torch.stack((self.box[0], size, high)).to(self.device)
         return self._place
 

@@ -97,7 +97,7 @@ class TableRows:
 
     def gather(self, out: Tensor | None = None) -> Tensor:
         """Returns the bricks, in `out` if that is given."""
-        out = torch.empty(self.shape, dtype=self.dtype) if out is None else out
+        out = torch.empty(self.shape, dtype=self.dtype, device="cpu") if out is None else out
         table, rows = wide_rows(self.table, out)
         torch.index_select(table, 0, self.row, out=rows)
         return out
@@ -282,7 +282,7 @@ class Staging:
             self._stream = torch.cuda.Stream(self._device)
             self._stream.wait_stream(torch.cuda.current_stream(self._device))
             self._device_ring.record_stream(self._stream)
-        self._host_ring = torch.empty(self.nbytes, dtype=torch.uint8, pin_memory=cuda)
+        self._host_ring = torch.empty(self.nbytes, dtype=torch.uint8, pin_memory=cuda, device="cpu")
 
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:

@@ -120,7 +120,7 @@ class FromChildren(OfProducers):
         """Returns the bricks of nodes of which some are at the finest level and some above it."""
         fine, coarse = ((mask.nonzero()[:, 0]) for mask in (finest, ~finest))
         finest_bricks = self._producer_bricks(nodes[fine])
-        kind = torch.full((len(nodes),), int(Region.DATA))
+        kind = torch.full((len(nodes),), int(Region.DATA), device="cpu")
         if finest_bricks.kind is not None:
             kind[fine.cpu()] = finest_bricks.kind.cpu()
         data, constants = {}, {}
@@ -162,8 +162,8 @@ class FromChildren(OfProducers):
     def _level_voxels(self, layout: Layout, depth: int, low: Tensor, size: int) -> Blocks:
         """Returns size^3 voxels of a level from each `low` (k, 3) x y z; outermost ones repeat."""
         step, brick = layout.branching ** (layout.depth - depth), layout.brick_size
-        last = torch.tensor([-(-n // step) - 1 for n in layout.extent])[:, None]
-        voxel = (low[:, :, None] + torch.arange(size)).clamp(min=0).minimum(last)
+        last = torch.tensor([-(-n // step) - 1 for n in layout.extent], device="cpu")[:, None]
+        voxel = (low[:, :, None] + torch.arange(size, device="cpu")).clamp(min=0).minimum(last)
         grid = torch.stack(torch.broadcast_tensors(*along_axes(voxel // brick)), -1)
         block, block_row = distinct_rows(grid.reshape(-1, 3))
         blocks = self._blocks(layout, torch.cat((block, torch.full_like(block[:, :1], depth)), 1))
@@ -231,6 +231,8 @@ class FromChildren(OfProducers):
 
 def _zeros(channels: Mapping[str, Channel], count: int, side: int) -> Blocks:
     return {
-        name: to_numpy(torch.zeros((count, *(side,) * 3, channel.width), dtype=channel.dtype))
+        name: to_numpy(
+            torch.zeros((count, *(side,) * 3, channel.width), dtype=channel.dtype, device="cpu")
+        )
         for name, channel in channels.items()
     }

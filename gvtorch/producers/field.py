@@ -99,7 +99,8 @@ class FieldProducer(Producer):
         self.field = field
         count = branching if samples is None else samples
         self.samples = check.integer(context, "samples", count, low=1, high=64)
-        offsets = (torch.arange(self.samples, dtype=torch.float64) + 0.5) / self.samples - 0.5
+        index = torch.arange(self.samples, dtype=torch.float64, device="cpu")
+        offsets = (index + 0.5) / self.samples - 0.5
         self.register_buffer("offsets", torch.cartesian_prod(offsets, offsets, offsets))
         self.threshold = self._thresholds(context, known_field, threshold)
         self.dtype = dtype or position_dtype(box, self.spacing)
@@ -276,7 +277,7 @@ def group_alike(
     splits = split and nodes.loc.device.type == "cpu"
     count = _BATCH_BRICKS if splits else max(1, len(nodes))
     if not isinstance(field, Field):
-        yield from ((rows, field) for rows in torch.arange(len(nodes)).split(count))
+        yield from ((rows, field) for rows in torch.arange(len(nodes), device="cpu").split(count))
         return
     center, half_extent = nodes.center, nodes.half_extent(margin)
     name, part_keys = type(field).__name__, field.alike(center, half_extent)
@@ -350,7 +351,7 @@ def _field_channels(context: str, field: nn.Module) -> dict[str, Channel]:
     """
     tensors = [*field.parameters(), *field.buffers()]
     device = tensors[0].device if tensors else torch.device("cpu")
-    points = torch.full((2, 5, 3), 0.25, device=device)
+    points = torch.full((2, 5, 3), 0.25, dtype=torch.float32, device=device)
     with torch.no_grad():
         if isinstance(field, Field) and field.prefiltered:
             values = _call_field(context, field, field.filtered, points, points)
@@ -381,13 +382,13 @@ def _grid(
     sides, middle = around[1] - around[0], around.mean(0)
     sizes = extent_of(context, extent)
     if isinstance(extent, Sequence):
-        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in sizes]))
+        half_size = sides / 2 * (1 + 4 / torch.tensor([max(n, 5) - 4 for n in sizes], device="cpu"))
     else:
         check.integer(context, "extent", extent, low=5)
         voxel = sides.max() / (sizes[0] - 4)
         x, y, z = (math.ceil(float(side / voxel) - 1e-9) + 4 for side in sides)
         sizes = x, y, z
-        half_size = torch.tensor(sizes, dtype=torch.float64) * voxel / 2
+        half_size = torch.tensor(sizes, dtype=torch.float64, device="cpu") * voxel / 2
     return sizes, ((middle - half_size).tolist(), (middle + half_size).tolist())
 
 

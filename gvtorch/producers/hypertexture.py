@@ -130,7 +130,7 @@ class Hypertexture(EvaluationCounter, Producer):
         self.octaves = [o._replace(amplitude=amplitude * o.amplitude) for o in series]
         self.dtype = position_dtype(box, self.spacing)
         self._levels: list[LevelOctaves] = []
-        self._margins = torch.empty(0)
+        self._margins = torch.empty(0, device="cpu")
 
     @property
     def saved(self) -> float:

@@ -82,8 +82,8 @@ class OctaveProducer(Producer):
         return self._by_level(nodes) if on_cpu else self._at_every_level(nodes)
 
     def _by_level(self, nodes: Nodes) -> dict[str, Tensor]:
-        shape = (len(nodes), *(nodes.layout.side,) * 3)
-        bricks = {name: torch.empty(shape, device=nodes.loc.device) for name in self._names}
+        shape, device = (len(nodes), *(nodes.layout.side,) * 3), nodes.loc.device
+        bricks = {n: torch.empty(shape, dtype=torch.float32, device=device) for n in self._names}
         for depth, rows in by_depth(nodes.loc):
             sums = self._sums(nodes[rows], depth)
             for name, values in zip(self._names, sums, strict=False):
@@ -91,8 +91,8 @@ class OctaveProducer(Producer):
         return bricks
 
     def _at_every_level(self, nodes: Nodes) -> dict[str, Tensor]:
-        shape = (len(nodes), *(nodes.layout.side,) * 3)
-        bricks = {name: torch.zeros(shape, device=nodes.loc.device) for name in self._names}
+        shape, device = (len(nodes), *(nodes.layout.side,) * 3), nodes.loc.device
+        bricks = {n: torch.zeros(shape, dtype=torch.float32, device=device) for n in self._names}
         for depth in range(nodes.layout.depth + 1):
             at_depth = (nodes.depth == depth)[:, None, None, None]
             without_parents = Nodes(nodes.loc, nodes.layout)  # a root has no parent

@@ -97,8 +97,8 @@ class PointProducer(Producer):
     def classify(self, nodes: Nodes) -> Regions:
         """Returns EMPTY where no point reaches into the brick, else DATA; and the value ranges."""
         channel = self.channels["value"]
-        kind = torch.full((len(nodes),), int(Region.EMPTY))
-        value_range = torch.zeros((len(nodes), 2, channel.width), dtype=torch.float64)
+        kind = torch.full((len(nodes),), int(Region.EMPTY), device="cpu")
+        value_range = torch.zeros((len(nodes), 2, channel.width), dtype=torch.float64, device="cpu")
         for rows, cubes in _by_level(nodes):
             bounds = ranges(self.points, cubes, narrow=self._includes_narrow(cubes))
             nonempty, low, high = (torch.from_numpy(array) for array in bounds)
@@ -112,7 +112,7 @@ class PointProducer(Producer):
         """Sums the points in each voxel, border included; voxels beyond the box are 0."""
         channel = self.channels["value"]
         shape = (len(nodes), *(nodes.layout.side,) * 3, channel.width)
-        out = torch.empty(shape, dtype=channel.dtype)
+        out = torch.empty(shape, dtype=channel.dtype, device="cpu")
         for rows, cubes in _by_level(nodes):
             sums = torch.from_numpy(values(self.points, cubes, narrow=self._includes_narrow(cubes)))
             self._warn_overflow(sums)

@@ -240,7 +240,7 @@ class StoredProducer(Producer):
     def classify(self, nodes: Nodes) -> Regions | Future:
         """Returns a future of the regions by the cells; all DATA at once if the store has none."""
         if not self.store.has_blocks:
-            return Regions(kind=torch.full((len(nodes),), Region.DATA))
+            return Regions(kind=torch.full((len(nodes),), Region.DATA, device="cpu"))
         return self._submit(self._classify, nodes)
 
     def fill(self, nodes: Nodes) -> Future:
@@ -325,7 +325,7 @@ class StoredProducer(Producer):
             if channel.coarse and not nodes.coarse:
                 continue
             shape = (len(loc), *(layout.side,) * 3, channel.width)
-            out = torch.zeros(shape, dtype=channel.dtype).numpy()
+            out = torch.zeros(shape, dtype=channel.dtype, device="cpu").numpy()
             for level in np.unique(node_level).tolist():
                 rows = np.flatnonzero(node_level == level)
                 if level < store.levels:

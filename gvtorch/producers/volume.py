@@ -86,8 +86,12 @@ class VolumeProducer(Producer):
         self._tables: dict[str, BrickTable] = {}  # by channel; rows by depth, z, y, x
         self._voxels: dict[str, Tensor] = {}  # by channel (v, c), in the same order
         self._nodes: dict[str, Tensor] = {}  # by channel (n, 3, c) low, high, mean, same order
-        self._grids = torch.empty(0)  # (d, 4) for each depth: first node, nodes along z, y, x
-        self._sizes = torch.empty(0)  # (d, 4) for each depth: first voxel, voxels along z, y, x
+        self._grids = torch.empty(
+            0, device="cpu"
+        )  # (d, 4) for each depth: first node, nodes along z, y, x
+        self._sizes = torch.empty(
+            0, device="cpu"
+        )  # (d, 4) for each depth: first voxel, voxels along z, y, x
 
     def prepare(self, layout: Layout) -> None:
         """Makes all levels, and all bricks if `hold` is "bricks"."""
@@ -144,7 +148,7 @@ class VolumeProducer(Producer):
         loc, data = nodes.loc.cpu(), {}
         for name, channel in channels.items():
             shape = (len(nodes), *(layout.side,) * 3, channel.width)
-            bricks = data[name] = torch.empty(shape, dtype=channel.dtype)
+            bricks = data[name] = torch.empty(shape, dtype=channel.dtype, device="cpu")
             for depth, level_rows in by_depth(loc):
                 zyx = loc[level_rows, :3].flip(1)
                 cut = cut_bricks(self._values[name][depth], zyx, layout.brick_size, layout.border)
@@ -183,17 +187,19 @@ def _node_rows(level: Level) -> Tensor:
 
 def _grid_offsets(sizes: Sequence[Sequence[int]]) -> Tensor:
     """Returns (d, 4) int64 for concatenated grids (z, y, x): index of the first entry, sizes."""
-    grids = torch.tensor([[*size] for size in sizes])
+    grids = torch.tensor([[*size] for size in sizes], device="cpu")
     count = grids.prod(1, keepdim=True)
     return torch.cat((count.cumsum(0) - count, grids), 1)
 
 
 def _all_bricks(values: list[Tensor], levels: list[Level], layout: Layout) -> Tensor:
     """Returns (n, s, s, s, c): the bricks of a channel, by level and then z, y, x."""
-    grids = (level.grid for level in levels[: len(values)])
-    node_positions = [torch.cartesian_prod(*map(torch.arange, grid)) for grid in grids]
+    node_positions = [
+        torch.cartesian_prod(*(torch.arange(n, device="cpu") for n in level.grid))
+        for level in levels[: len(values)]
+    ]
     shape = (sum(map(len, node_positions)), *(layout.side,) * 3, values[0].shape[3])
-    bricks, begin = torch.empty(shape, dtype=values[0].dtype), 0
+    bricks, begin = torch.empty(shape, dtype=values[0].dtype, device="cpu"), 0
     for level, zyx in zip(values, node_positions, strict=True):
         for part in zyx.split(_BATCH_BRICKS):
             cut = cut_bricks(level, part, layout.brick_size, layout.border)

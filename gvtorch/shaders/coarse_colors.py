@@ -52,7 +52,9 @@ class VolumeField:
             if first >= 0 and end <= size:
                 box = box.narrow(axis, first, end - first)
             else:
-                box = box.index_select(axis, torch.arange(first, end).clamp(0, size - 1))
+                box = box.index_select(
+                    axis, torch.arange(first, end, device="cpu").clamp(0, size - 1)
+                )
         return box.view(self._values.dtype)
 
 
@@ -129,6 +131,7 @@ def _sums_along(
     coarse = {  # for levels whose voxels are wider than a tile: sums of each tile's columns
         level: torch.zeros(
             (2, painter.width + 1, -(-length // side), *(-(-n // tile) for n in cross_sizes)),
+            dtype=torch.float32,
             device=device,
         )
         for level, side in enumerate(level_sides)
@@ -268,8 +271,8 @@ class _Columns:
     @classmethod
     def empty(cls, numbers: int, shape: tuple[int, ...], device: torch.device) -> _Columns:
         """Returns intervals that hold nothing."""
-        color = torch.zeros((numbers, *shape), device=device)
-        return cls(color, color, torch.ones(shape, device=device))
+        color = torch.zeros((numbers, *shape), dtype=torch.float32, device=device)
+        return cls(color, color, torch.ones(shape, dtype=torch.float32, device=device))
 
     def joined(self, count: int) -> _Columns:
         """Composites every `count` intervals into one; the last is repeated if some are missing."""

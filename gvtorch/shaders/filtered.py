@@ -160,7 +160,7 @@ class Filtered(Shader):
         bricks, color_channel = tree.bricks, shader.colors(tree.spacing)
         side = bricks.brick_size + 2 * bricks.border
         colors = torch.zeros(
-            (count, side, side, side, color_channel.width), dtype=color_channel.dtype
+            (count, side, side, side, color_channel.width), dtype=color_channel.dtype, device="cpu"
         )
         level_arguments = (tree.branching, tree.depth, tree.device, color_channel.width)
         levels = shader.levels(volume, *level_arguments, progress)

@@ -142,7 +142,7 @@ class Labels(LitShader):
     def label_names(self, tree: N3Tree, channel: str) -> Tensor:
         def make() -> Tensor:
             _, labels = label_rows(tree, channel)
-            no_label = torch.full((1,), -1, dtype=torch.int64)
+            no_label = torch.full((1,), -1, dtype=torch.int64, device="cpu")
             return torch.cat((no_label, torch.from_numpy(labels))).to(tree.device)
 
         return self._cached(tree, channel, (tree.device,), make)

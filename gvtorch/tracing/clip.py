@@ -288,7 +288,7 @@ def _box(name: str, numbers: Any) -> list[Face]:
                 f"Clip: {name} must have its low corner below its high one on each axis, "
                 f"got {low.tolist()} and {high.tolist()}"
             )
-        axes, start, end = torch.eye(3, dtype=torch.float64), low, high
+        axes, start, end = torch.eye(3, dtype=torch.float64, device="cpu"), low, high
     else:
         matrix = check.reals("Clip", name, numbers, (4, 4))
         volume, sides = torch.linalg.det(matrix).abs(), matrix[:3, :3].norm(dim=0)

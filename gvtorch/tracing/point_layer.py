@@ -60,7 +60,7 @@ def point_layer(
     if reference is not None:
         reference = check.number(context, "reference", reference, low=0, open_low=True)
     points, grid = producer.points, producer.points.grid
-    placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64))
+    placed = camera.placed(torch.tensor([grid.low, grid.high], dtype=torch.float64, device="cpu"))
     view, K = placed.viewmats[0].numpy(), placed.Ks[0].numpy()
     eye = -view[:3, 3] @ view[:3, :3]
     # The blend of levels: 0 where a pixel is as wide as a finest voxel, 1 as one of the next level.

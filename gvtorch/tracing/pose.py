@@ -37,7 +37,9 @@ class Pose:
             return matrix
         numbers = check.reals(context, name, matrix, (4, 4))
         turn = numbers[:3, :3]
-        deviation = float((turn.T @ turn - torch.eye(3, dtype=torch.float64)).abs().max())
+        deviation = float(
+            (turn.T @ turn - torch.eye(3, dtype=torch.float64, device="cpu")).abs().max()
+        )
         if numbers[3].tolist() != [0, 0, 0, 1] or deviation > _ROUNDING:
             raise ValueError(
                 f"{context}: {name} must turn and shift, and neither stretch nor shear, "
@@ -79,8 +81,10 @@ class Pose:
     def light_to_tree(self, parameter_54: Tensor) -> Tensor:
         """Returns `ShadeParameters` (5, 4) with the light in the tree's axes."""
         parameters = ShadeParameters.read(parameter_54)
-        light = torch.as_tensor(parameters.light).double()
-        is_point = torch.as_tensor(parameters.light_kind) == LightKind.POINT
+        light = torch.as_tensor(parameters.light, device=parameter_54.device).double()
+        is_point = (
+            torch.as_tensor(parameters.light_kind, device=parameter_54.device) == LightKind.POINT
+        )
         columns = [
             torch.where(is_point, a - s, a)
             for a, s in zip(light.unbind(0), self.shift, strict=True)

@@ -249,9 +249,9 @@ def _pose(eye: Eye) -> Tensor:
     the distance from eye to target, and the target as their origin.
     """
     view = Camera.look_at(eye.eye, eye.target, eye.up).viewmats[0]
-    target = torch.tensor(eye.target, dtype=torch.float64)
-    distance = (target - torch.tensor(eye.eye, dtype=torch.float64)).norm()
-    pose = torch.eye(4, dtype=torch.float64)
+    target = torch.tensor(eye.target, dtype=torch.float64, device="cpu")
+    distance = (target - torch.tensor(eye.eye, dtype=torch.float64, device="cpu")).norm()
+    pose = torch.eye(4, dtype=torch.float64, device="cpu")
     pose[:3, :3], pose[:3, 3] = distance * view[:3, :3].T, target
     return pose
 

@@ -121,7 +121,7 @@ class Planes:
             ValueError, OSError: With `wait`, a plane can't be read.
         """
         parts = panes(width, height)
-        color = torch.full((height, width, 3), _BACKGROUND)
+        color = torch.full((height, width, 3), _BACKGROUND, device="cpu")
         view = parts["view"]
         _paste(color, view, _resized(picture.color.detach().cpu().float(), view))
         layout: dict[str, Any] = {"view": list(view)}
@@ -134,7 +134,7 @@ class Planes:
             layout[axis]["position"] = self.position(state)
             if image is not None:
                 _paste(color, Pane(*layout[axis]["image"]), torch.from_numpy(image))
-        ones = torch.ones(height, width, 1)
+        ones = torch.ones(height, width, 1, device="cpu")
         infinite = ones * torch.inf
         composite = Picture(
             color=color,

@@ -113,7 +113,7 @@ class Eye:
 
     def fitted(self, box: Tensor, width: int, height: int) -> Self:
         """Returns the eye that looks the same way and sees the whole (2, 3) box."""
-        eye, target = torch.tensor((self.eye, self.target), dtype=torch.float64)
+        eye, target = torch.tensor((self.eye, self.target), dtype=torch.float64, device="cpu")
         centre, radius = box.mean(0), float((box[1] - box[0]).norm()) / 2
         half_angle = math.radians(min(self.fov, 100.0)) / 2
         aspect = min(1.0, max(1, width) / max(1, height))

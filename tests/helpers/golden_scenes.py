@@ -411,7 +411,11 @@ def camera_of(s: Settings) -> gv.Camera | gv.Rays:
     if kind in ("orbit", "batch"):
         distance = 0.2 if s["inside"] else 0.3 + s["away"]
         turn = 40 * s["fov"]
-        turns = torch.tensor([turn, turn + 70], dtype=torch.float64) if kind == "batch" else turn
+        turns = (
+            torch.tensor([turn, turn + 70], dtype=torch.float64, device="cpu")
+            if kind == "batch"
+            else turn
+        )
         return gv.Camera.orbit(turns, 100 * s["aim"][0], distance, s["fov"], width, height)
     if kind in ("directions", "rays"):
         return _own_rays(s, eye, target)
@@ -446,8 +450,8 @@ def _own_rays(s: Settings, eye: np.ndarray, target: np.ndarray) -> gv.Camera | g
     ends = span if s["ends"] else (0.0, math.inf)
     if s["camera"] == "directions":
         vectors = [torch.from_numpy(part) for part in (origin, direction)]
-        cone_tensor = None if s["cone"] == "pixel" else torch.tensor(cone)
-        limits = torch.tensor(ends, dtype=torch.float64)
+        cone_tensor = None if s["cone"] == "pixel" else torch.tensor(cone, device="cpu")
+        limits = torch.tensor(ends, dtype=torch.float64, device="cpu")
         return gv.CustomCamera.from_directions(*vectors, cone=cone_tensor, range=limits)
     count = width * height
     columns = {

@@ -38,7 +38,7 @@ class Marcher(Peer):
         wrap, linear = dr.WrapMode.Clamp, dr.FilterMode.Linear
         tensor = llvm.TensorXf(voxels)
         self.texture = llvm.Texture3f(tensor, filter_mode=linear, wrap_mode=wrap)
-        sizes = torch.tensor(task.scene.volume.extent, dtype=torch.float64)
+        sizes = torch.tensor(task.scene.volume.extent, dtype=torch.float64, device="cpu")
         origin, direction = (task.rays.origin + 0.5) / sizes, task.rays.direction / sizes
         self.origin, self.direction = (
             llvm.Array3f(*(llvm.Float(ray[:, axis].float().numpy()) for axis in range(3)))

@@ -104,7 +104,8 @@ class SplineSum(EvaluationCounter):
     def _sum_from_coarsest(self, low: Sequence[Tensor], size: int, side: float) -> Tensor:
         """Returns the sum in k cubes of voxels, from the coarsest octave on, without parents."""
         if not self.held(2 * side):
-            zeros = torch.zeros((len(low[0]), size, size, size), device=low[0].device)
+            shape = (len(low[0]), size, size, size)
+            zeros = torch.zeros(shape, dtype=torch.float32, device=low[0].device)
             return self._add_octave(zeros, low, side)
         parent_low = [(coordinate - 1) // 2 for coordinate in low]
         coarse = self._sum_from_coarsest(parent_low, size // 2 + 2, 2 * side)

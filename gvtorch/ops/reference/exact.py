@@ -21,7 +21,8 @@ def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
 
 def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
     """Returns a / b, rounded once. Given a number, torch itself multiplies by a reciprocal."""
-    return torch.div(torch.as_tensor(a).to(like), torch.as_tensor(b).to(like).expand(like.shape))
+    a, b = (torch.as_tensor(n, dtype=like.dtype, device=like.device) for n in (a, b))
+    return torch.div(a, b.expand(like.shape))
 
 
 def smaller(a: Tensor, b: Tensor) -> Tensor:

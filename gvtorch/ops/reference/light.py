@@ -65,7 +65,8 @@ class Light:
 
     def towards(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns (r, 3) directions and (r,) distances to the light, and (r,) growth of cones."""
-        backward, light_vector = -self.direction, torch.as_tensor(self.parameters.light)
+        backward = -self.direction
+        light_vector = torch.as_tensor(self.parameters.light, device=t.device)
         length = torch.full_like(t, INF)
         growth = torch.zeros_like(t) + self.parameters.light_growth
         if self.parameters.light_kind == LightKind.DIRECTIONAL:
@@ -105,7 +106,7 @@ class Light:
         p = self.parameters
         diffuse = (p.diffuse * facing)[:, None]
         specular = (p.specular * highlight)[:, None]
-        light = torch.as_tensor(p.light_color)
+        light = torch.as_tensor(p.light_color, device=base.device)
         return base * (p.ambient + diffuse * light) + specular * light
 
     def shade_rough(
@@ -178,7 +179,7 @@ class Light:
             weight = weight * (base * base) * OCTAVE_LIGHT
             g = g * OCTAVE_DIRECTION
             clear = sqrt_exact(clear)
-        light = torch.as_tensor(p.light_color)
+        light = torch.as_tensor(p.light_color, device=base.device)
         return base * p.ambient + p.diffuse * light * total
 
     def faintest(self, stop_clear: Tensor) -> Tensor:

@@ -95,7 +95,8 @@ class Probe:
 
     def slope(self, holder: Holder, t: Tensor, cube: Tensor) -> Tensor:
         """Returns (r, 3) gradients from one of the nodes; see `gradient`."""
-        half = 0.5 * torch.eye(3).to(t)[:, None]  # (axis, 1, 3) voxels along each axis
+        # (axis, 1, 3) voxels along each axis
+        half = 0.5 * torch.eye(3, dtype=t.dtype, device=t.device)[:, None]
         low, high = self.channel.sample(holder, t, torch.stack((-half, half)))  # (axis, r)
         return ((high - low) * (holder.scale / cube[:, None])).mT
 
@@ -355,8 +356,7 @@ class Plain(Visitor):
     def begin(cls, rays: RayArguments, args: TraceArguments, walk: Walk, *fields: Any) -> Self:
         """Returns a shader before its first interval; `fields` are the fields of a subclass."""
         hit_clear, stop_clear = (
-            1 - torch.tensor(alpha, dtype=args.table_lm4.dtype).to(args.table_lm4)
-            for alpha in (args.depth_alpha, args.stop_alpha)
+            1 - args.table_lm4.new_tensor(alpha) for alpha in (args.depth_alpha, args.stop_alpha)
         )
         sums = ShadeSum(walk.intervals.beam, hit_clear, rays.clear_r)
         return cls(Transfer(args), walk.channel, sums, stop_clear, *fields)

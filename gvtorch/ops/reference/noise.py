@@ -293,7 +293,7 @@ def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor
     if at_once or needs_gradient or first.numel() <= CHUNK:
         return evaluate(*axes)
     flat = [coordinate.reshape(-1) for coordinate in axes]
-    out = torch.empty(first.numel(), dtype=first.dtype)
+    out = torch.empty(first.numel(), dtype=first.dtype, device=first.device)
     for begin in range(0, len(out), CHUNK):
         chunk = slice(begin, begin + CHUNK)
         out[chunk] = evaluate(*(coordinate[chunk] for coordinate in flat))

@@ -69,7 +69,7 @@ class Beam(Rows):
         moved = torch.where((entry > 0) & (entry < INF), entry, 0.0)
         near_cone, growth = (rays.cone_r2 * args.cone_scale).unbind(1)
         high_real, deep = high.to(real), is_deep(args)
-        last_real = (high_real * torch.tensor(0.9999999).to(high_real)).double()
+        last_real = (high_real * (1 - 2.0**-23)).double()
         scene = SceneBox(high, high * (1 - 2.0**-50) if deep else last_real, deep)
         columns = (
             direction,
@@ -150,7 +150,7 @@ class Intervals:
 
     def __init__(self, beam: Beam, step: float | Tensor, levels: int) -> None:
         first = beam.first
-        length = [torch.as_tensor(step, dtype=first.dtype).to(first)]
+        length = [torch.as_tensor(step, dtype=first.dtype, device=first.device)]
         for _ in range(levels - 1):
             length.append(length[-1] + length[-1])
         self.beam, self.start = beam, first

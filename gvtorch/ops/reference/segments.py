@@ -114,7 +114,7 @@ def sample_bricks(
     beam = Beam.enter(rays, args, real)[torch.where(valid, ray[segment], 0)]
     base, end, lookup_t = segments.distance[segment].unbind(1)
     first, _, level = segments.interval[segment].unbind(1)
-    length = torch.tensor(args.step, dtype=real).to(base) * 2.0 ** level.clamp(min=0).to(real)
+    length = base.new_tensor(args.step) * 2.0 ** level.clamp(min=0).to(real)
     middle = base + ((first + samples.number).to(real) + 0.5) * length
     t = torch.where(level == _ODD, base + (end - base) * 0.5, middle)
 

@@ -82,7 +82,7 @@ class Isosurface(Lit):
         numbers = self.light.parameters.own_as(IsosurfaceNumbers)
         self.numbers, self.level, self.filled = (
             numbers,
-            torch.as_tensor(numbers.level),
+            torch.as_tensor(numbers.level, device=zeros.device),
             numbers.filled,
         )
         self.is_hit = torch.zeros_like(zeros, dtype=torch.bool)
