@@ -415,7 +415,7 @@ def test_report_tells_stages_rates_and_occupancy(blobs):
         (lambda v: engine(v, load_budget="many"), "load_budget must be an int >= 1"),
         (lambda v: engine(v, scout_rounds=-1), "scout_rounds must be an int >= 0"),
         (lambda v: engine(v, device="gpu"), "device must name a device, got 'gpu'"),
-        (lambda v: engine(v, strict="no"), "strict must be bool, got 'no'"),
+        (lambda v: engine(v, strict="no"), "strict must be a bool, got str"),
         (lambda v: gv.VolumeProducer("scan"), "VolumeProducer: channel 'value'"),
         (lambda v: gv.VolumeProducer({}), "VolumeProducer: volume must name at least one"),
         (lambda v: gv.Producer(4, channels={"a": torch.uint8}), "channels['a'] must be a Channel"),

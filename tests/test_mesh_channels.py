@@ -112,7 +112,7 @@ def test_producers_that_do_not_go_together_are_told(mesh):
 
 
 def test_what_a_store_has_not_is_told(store, tmp_path):
-    with pytest.raises(ValueError, match="has no channel 'distance'; there are coverage, color"):
+    with pytest.raises(ValueError, match="unknown channel 'distance'; the store has coverage, c"):
         gv.StoredChannels(store, ("distance",))
     plain = tmp_path / "plain.zarr"
     gv.voxelize(meshes.box(), plain, resolution=16)

@@ -145,9 +145,9 @@ def test_eviction_clears_every_pointer_to_a_shared_tile():
         (lambda: gv.Producer(4, box=((0, 0, 0),)), "box must be two corners"),
         (lambda: gv.Producer(4, branching=1), "branching must be an int >= 2"),
         (lambda: gv.Producer(4.5), "extent must be an int >= 1"),
-        (lambda: gv.Producer(4, value_range={"a": (0, 1)}), "value_range has channel 'a'; there"),
+        (lambda: gv.Producer(4, value_range={"a": (0, 1)}), "value_range: unknown channel 'a'; "),
         (lambda: gv.Producer(4, value_range={"value": (1, 0)}), "must be (smallest, largest)"),
-        (lambda: gv.Producer(4, labels={"a": None}), "labels has channel 'a'; there are value"),
+        (lambda: gv.Producer(4, labels={"a": None}), "labels: unknown channel 'a'; the producer"),
     ],
 )
 def test_bad_producers_are_named(call, message):

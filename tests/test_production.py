@@ -149,7 +149,7 @@ def test_failures_can_be_forgotten_and_are_then_asked_for_again():
         ),
         (
             lambda n: gv.Regions(kind=torch.full((len(n),), 2), constants={"red": torch.zeros(8)}),
-            "classify: constants has channel 'red'; the producer has value",
+            "classify: constants: unknown channel 'red'; the producer has value",
         ),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -71,6 +72,15 @@ def test_what_json_leaves_out_or_can_not_tell_stays():
     assert changed.options.background is options.background
     with pytest.raises(ValueError, match="JSON can't represent"):
         gv.ViewState(shader=HOT).changed({"options": {"lens": {"kept": "a lens"}}})
+
+
+def test_a_choice_among_large_numbers_is_accepted():
+    hint = Literal[256, 1024]  # a field of a script's dataclass, of which the page makes a choice
+    assert schema.decode("size", hint, json.loads("1024")) == 1024
+    with pytest.raises(ValueError, match="must be 256 or 1024, got 512"):
+        schema.decode("size", hint, 512)
+    with pytest.raises(ValueError, match="must be 0 or 1, got True"):
+        schema.decode("bit", Literal[0, 1], True)
 
 
 def test_every_field_of_a_dataclass_is_in_the_state():

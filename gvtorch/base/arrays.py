@@ -50,13 +50,10 @@ class ArrayLike:
 
     def grid(self, time: int) -> np.ndarray:
         """Returns a time point, (z, y, x, c), with axes that run backwards flipped."""
-        data = self.read(
-            tuple(
-                slice(time, time + 1) if axis == "t" else slice(0, n)
-                for axis, n in zip(self.axes, self.shape, strict=True)
-            )
-        )
-        data = boxes.to_zyxc(data, self.axes, "tzyxc")[0]
+        index = [slice(0, n) for n in self.shape]
+        if "t" in self.axes:
+            index[self.axes.index("t")] = slice(time, time + 1)
+        data = boxes.to_zyxc(self.read(tuple(index)), self.axes, "tzyxc")[0]
         return np.flip(data, tuple("zyx".index(axis) for axis in self.flips))
 
     def read(self, index: tuple[slice, ...]) -> np.ndarray:

@@ -67,9 +67,8 @@ def to_zyxc(data: np.ndarray, axes: str, order: str = "zyxc") -> np.ndarray:
 
 def tile_indices(low: Zyx, high: Zyx, sides: Zyx) -> Iterator[tuple[int, ...]]:
     """Yields the index of each tile of `sides` voxels that overlaps a box."""
-    return itertools.product(
-        *(range(a // n, -(-b // n)) for a, b, n in zip(low, high, sides, strict=True))
-    )
+    spans = zip(low, high, sides, strict=True)
+    return itertools.product(*(range(a // n, -(-b // n)) for a, b, n in spans))
 
 
 def paste(out: np.ndarray, low: Zyx, tile: np.ndarray, corner: Zyx) -> None:

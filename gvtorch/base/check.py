@@ -80,10 +80,8 @@ def tensor(
         if all(isinstance(expected, str) or expected == size for expected, size in pairs):
             return
     wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-    dtype_name = str(dtype).removeprefix("torch.")
-    raise ValueError(
-        f"{context}: {name} must be ({wanted}) {dtype_name} on {device}, got {describe(value)}"
-    )
+    form = f"({wanted}) {str(dtype).removeprefix('torch.')} on {device}"
+    raise ValueError(f"{context}: {name} must be {form}, got {describe(value)}")
 
 
 _DIGIT_SIZES = {str(digit): digit for digit in range(10)}
@@ -245,9 +243,7 @@ def device(context: str, value: Any) -> torch.device:
     index = torch.cuda.current_device() if parsed.index is None else parsed.index
     count = torch.cuda.device_count()
     if index >= count:
-        raise ValueError(
-            f"{context}: device {parsed} can't be used here: torch sees {count} of them"
-        )
+        raise ValueError(f"{context}: device {parsed} can't be used here: torch sees {count}")
     return torch.device("cuda", index)
 
 
@@ -277,9 +273,8 @@ def nbytes(context: str, name: str, value: Any) -> int:
         match = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*([A-Za-z]*)\s*", value)
         unit = _BYTE_UNITS.get(match[2].upper()) if match else None
         if match is None or unit is None:
-            raise ValueError(
-                f'{context}: {name} must be bytes, as in "256 MB", got {quoted(value)}'
-            )
+            got = quoted(value)
+            raise ValueError(f'{context}: {name} must be bytes, as in "256 MB", got {got}')
         value = int(min(float(match[1]) * unit, 2.0**63))
     return integer(context, name, value, low=1, high=2**62)
 
@@ -361,16 +356,14 @@ def triple(
     except TypeError:
         raise ValueError(f"{context}: {name} must be three numbers, got {quoted(value)}") from None
     if len(items) != 3:
-        raise ValueError(
-            f"{context}: {name} must be three numbers, got {len(items)}: {quoted(value)}"
-        )
+        got = f"{len(items)}: {quoted(value)}"
+        raise ValueError(f"{context}: {name} must be three numbers, got {got}")
     x, y, z = (number(context, name, item, low=low, high=high) for item in items)
     if positive and min(x, y, z) <= 0:
         raise ValueError(f"{context}: {name} must be positive, got {(x, y, z)}")
     if positive and not _MIN_SIZE <= min(x, y, z) <= max(x, y, z) <= 1 / _MIN_SIZE:
-        raise ValueError(
-            f"{context}: {name} must be {_MIN_SIZE:g} to {1 / _MIN_SIZE:g}, got {(x, y, z)}"
-        )
+        limits = f"{_MIN_SIZE:g} to {1 / _MIN_SIZE:g}"
+        raise ValueError(f"{context}: {name} must be {limits}, got {(x, y, z)}")
     return (x, y, z)
 
 

@@ -63,9 +63,8 @@ def positive(owner: Any, name: str, value: Any) -> float:
 
 def whole_between(low: int, high: int = sys.maxsize) -> Check:
     """Returns a check for a whole number from `low` to `high`."""
-    return lambda owner, name, value: check.integer(
-        class_name(owner), name, value, low=low, high=high
-    )
+    limits = {"low": low, "high": high}
+    return lambda owner, name, value: check.integer(class_name(owner), name, value, **limits)
 
 
 def name_text(owner: Any, name: str, value: Any) -> str:

@@ -73,9 +73,8 @@ def pool_mean(values: Grid, factor: int | Sequence[int]) -> Grid:
     """
 
     def reduce(part: Grid, factors: Factors) -> Grid:
-        return _rounded_mean(
-            _reduce_blocks(part, factors, "mean"), math.prod(factors), _dtype_name(values)
-        )
+        sums = _reduce_blocks(part, factors, "mean")
+        return _rounded_mean(sums, math.prod(factors), _dtype_name(values))
 
     return _reduce_slabs(values, factor, reduce)
 
@@ -216,9 +215,8 @@ def _reduce_axis(
     if how == "mean" and sum_dtype is None:
         sum_dtype = _sum_dtype(_dtype_name(values), size)
     count = (values.shape[axis] - size) // step + 1
-    result = _cast(
-        _strided(values, axis, 0, step, count), sum_dtype or _dtype_name(values), copy=True
-    )
+    first = _strided(values, axis, 0, step, count)
+    result = _cast(first, sum_dtype or _dtype_name(values), copy=True)
     combine = _combine(values, how)
     for k in range(1, size):
         combine(result, _strided(values, axis, k, step, count), out=result)

@@ -32,18 +32,10 @@ def explicit(record: type) -> Callable[[Function], Function]:
 
     def decorate(function: Function) -> Function:
         signature = inspect.signature(function)
-        own_parameters = [
-            parameter
-            for parameter in signature.parameters.values()
-            if parameter.kind is not parameter.VAR_KEYWORD
-        ]
+        *own_parameters, _ = signature.parameters.values()
+        kind = inspect.Parameter.KEYWORD_ONLY
         options = [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=field.type,
-            )
+            inspect.Parameter(field.name, kind, default=field.default, annotation=field.type)
             for field in fields(record)
         ]
         documented: Any = function

@@ -111,7 +111,5 @@ class ImageInfo:
             info["pose"] = "; ".join(" ".join(f"{n:.6g}" for n in row) for row in self.pose[:3])
         if self.time_step is not None:
             info["time step"] = f"{self.time_step:g} {self.time_unit or ''}".strip()
-        info["channel info"] = {
-            str(number): channel.describe() for number, channel in enumerate(self.channels)
-        }
+        info["channel info"] = {str(n): c.describe() for n, c in enumerate(self.channels)}
         return {name: value for name, value in info.items() if value}

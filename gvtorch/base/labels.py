@@ -34,10 +34,9 @@ def as_whole(context: str, values: np.ndarray) -> np.ndarray:
         return values.astype(np.int64)
     if values.dtype.kind not in "iu":
         raise ValueError(f"{context}: labels must be whole numbers, got {values.dtype}")
-    if values.dtype == np.uint64 and values.size and int(values.max()) > np.iinfo(np.int64).max:
-        raise ValueError(
-            f"{context}: labels must be below 2^63, got {int(values.max())}: renumber them"
-        )
+    largest = int(values.max(initial=0)) if values.dtype == np.uint64 else 0
+    if largest > np.iinfo(np.int64).max:
+        raise ValueError(f"{context}: labels must be below 2^63, got {largest}: renumber them")
     return values
 
 
@@ -97,11 +96,9 @@ def stored_labels(context: str, values: np.ndarray) -> tuple[np.ndarray, np.ndar
 def counted(labels: Any) -> str:
     """Returns the number and range of labels (k,), without background 0, as "12, 1 to 40"."""
     foreground = labels[labels != 0]
-    return (
-        f"{len(foreground)}, {int(foreground.min())} to {int(foreground.max())}"
-        if len(foreground)
-        else "0"
-    )
+    if not len(foreground):
+        return "0"
+    return f"{len(foreground)}, {int(foreground.min())} to {int(foreground.max())}"
 
 
 def background(labels: np.ndarray | None) -> int | None:

@@ -83,14 +83,10 @@ class Hits:
         self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
     ) -> Hits:
         """Returns the hits on a device, floats in another dtype. None leaves either as it is."""
-        return replace(
-            self, **{name: to_device(v, device, dtype) for name, v in vars(self).items()}
-        )
+        return replace(self, **{n: to_device(v, device, dtype) for n, v in vars(self).items()})
 
     def __repr__(self) -> str:
-        extra = [
-            name for name in ("normal", "features", "label") if getattr(self, name) is not None
-        ]
+        extra = [n for n in ("normal", "features", "label") if getattr(self, n) is not None]
         return f"Hits({', '.join([check.describe(self.color), *extra])})"
 
 

@@ -90,7 +90,6 @@ class stage:  # not a generator-based context manager, which is slower: a frame 
     __slots__ = ("_began", "_name", "_ranges", "_start", "_timings")
 
     def __init__(self, name: str) -> None:
-        """Takes the stage's name."""
         self._name = name
 
     def __enter__(self) -> None:
@@ -221,10 +220,8 @@ class Timeline:
     def _track(self) -> int:
         thread = threading.current_thread()
         with self._lock:
-            track = self._tracks.setdefault(
-                threading.get_ident(), (len(self._tracks) + 1, thread.name)
-            )
-        return track[0]
+            new_track = (len(self._tracks) + 1, thread.name)
+            return self._tracks.setdefault(threading.get_ident(), new_track)[0]
 
     def _events(self) -> list[dict[str, object]]:
         """Returns all events of the file; waits for the device."""

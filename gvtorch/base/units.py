@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-#: NGFF's name, length in metres, and other spellings in files.
+#: NGFF's name, length in metres, and other spellings in files, of which the first is the symbol.
 _LENGTHS: tuple[tuple[str, float, str], ...] = (
     ("meter", 1.0, "m meters metre metres"),
     ("decimeter", 1e-1, "dm decimetre"),
     ("centimeter", 1e-2, "cm centimeters centimetre centimetres"),
     ("millimeter", 1e-3, "mm millimeters millimetre millimetres"),
-    ("micrometer", 1e-6, "um \u00b5m \u03bcm micron microns micrometers micrometre micrometres"),
+    ("micrometer", 1e-6, "\u00b5m um \u03bcm micron microns micrometers micrometre micrometres"),
     ("nanometer", 1e-9, "nm nanometers nanometre nanometres"),
     ("angstrom", 1e-10, "\u00c5 \u212b a angstroms"),
     ("picometer", 1e-12, "pm picometers picometre"),
@@ -64,10 +64,7 @@ def unit_symbol(text: str | None) -> str:
     name = length_unit(text)
     if name is None:
         return text or ""
-    symbols = {"micrometer": "\u00b5m", "angstrom": "\u00c5"}
-    return symbols.get(name) or next(
-        spellings.split()[0] for n, _, spellings in _LENGTHS if n == name
-    )
+    return next(spellings.split()[0] for unit, _, spellings in _LENGTHS if unit == name)
 
 
 #: The note for files that store the width of pixels, but not the distance between slices.

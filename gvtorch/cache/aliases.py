@@ -42,7 +42,6 @@ class AliasRows(NamedTuple):
     exact: Tensor  # (a,) bool, whether `target` lies at `goal`
 
     def select(self, index: Tensor) -> AliasRows:
-        """Returns some of the rows."""
         return AliasRows(*(field[index] for field in self))
 
 
@@ -57,7 +56,6 @@ class Aliases:
     rows: AliasRows
 
     def __init__(self, nodes: NodePool, bricks: BrickPool) -> None:
-        """Starts without any."""
         self.nodes, self.bricks = nodes, bricks
         self.trees: dict[int, N3Tree] = {}
         self.clear()
@@ -77,7 +75,6 @@ class Aliases:
         self._alias_paths = no_nodes, no_nodes
 
     def __len__(self) -> int:
-        """Number of aliases."""
         return len(self.rows.node)
 
     def add(self, node: Tensor, tree: int, loc_k4: Tensor, goal: Tensor, goal_tree: int) -> None:
@@ -89,9 +86,8 @@ class Aliases:
             torch.cat((torch.full_like(loc[:, :1], number), loc), 1)
             for number, loc in ((tree, loc_k4), (goal_tree, goal))
         )
-        new = AliasRows(
-            node, own_loc, goal_loc, node, own_loc, torch.zeros_like(node, dtype=torch.bool)
-        )
+        not_exact = torch.zeros_like(node, dtype=torch.bool)
+        new = AliasRows(node, own_loc, goal_loc, node, own_loc, not_exact)
         joined = [torch.cat(pair) for pair in zip(self.rows.select(kept), new, strict=True)]
         order = joined[0].argsort()
         self.rows = AliasRows(*(field[order] for field in joined))
@@ -221,12 +217,11 @@ class Aliases:
     def _copy_pending(self) -> None:
         """Copies the pending bits of targets to their aliases, so that rays need not ask again."""
         words, rows = self.nodes.request_tn.view(-1), self.rows
-        pending = words[rows.target] & REQUEST_KINDS << REQUEST_PENDING_SHIFT
-        subdividing = torch.where(pending & REQUEST_SUBDIVIDE << REQUEST_PENDING_SHIFT != 0, -1, 0)
-        pending = torch.where(
-            rows.exact, pending, subdividing & REQUEST_KINDS << REQUEST_PENDING_SHIFT
-        )
-        words[rows.node] &= ~(REQUEST_KINDS << REQUEST_PENDING_SHIFT)
+        all_bits = REQUEST_KINDS << REQUEST_PENDING_SHIFT
+        pending = words[rows.target] & all_bits
+        subdividing = (pending & REQUEST_SUBDIVIDE << REQUEST_PENDING_SHIFT) != 0
+        pending = torch.where(rows.exact, pending, torch.where(subdividing, all_bits, 0))
+        words[rows.node] &= ~all_bits
         words[rows.node] |= pending.to(words.dtype)
 
     def _paths(self) -> tuple[Tensor, Tensor]:

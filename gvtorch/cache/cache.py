@@ -82,11 +82,9 @@ class LRU:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its memory."""
         return self._memory.nbytes
 
     def __len__(self) -> int:
-        """Number of slots."""
         return len(self.order)
 
     def __repr__(self) -> str:

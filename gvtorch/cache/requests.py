@@ -54,7 +54,6 @@ class Requests:
         return cls(node=node, depth=depth, priority=priority, coarse=coarse)
 
     def __len__(self) -> int:
-        """Number of requests."""
         return self.node.shape[0]
 
     def fitting(self, rank: Tensor, room: Sequence[int]) -> Tensor:
@@ -147,10 +146,8 @@ def requests_below(cache: Cache, subdivisions: Requests, branching: int) -> Requ
     free = sum(lru.unused for lru in cache.lru[REQUEST_SUBDIVIDE])
     node, split = nodes_to_subdivide(cache, tile, priority, free)
     node, priority = node[split], priority[:, None].expand_as(split)[split]
-    no_requests = node[:0], priority[:0]
-    return _requests_of_targets(
-        cache, {REQUEST_LOAD: no_requests, REQUEST_SUBDIVIDE: (node, priority)}
-    )
+    requests = {REQUEST_LOAD: (node[:0], priority[:0]), REQUEST_SUBDIVIDE: (node, priority)}
+    return _requests_of_targets(cache, requests)
 
 
 def _requests_of_targets(
@@ -167,13 +164,8 @@ def coarser_requests(
     """Replaces requests by coarser ones where slots are too few for all, so that what gets no slot
     is drawn from a near ancestor and not from the root.
 
-    Requests are moved up the tree, the deepest first, until they name at most as many nodes as
-    there are slots.
-
-    Args:
-        cache: The pools.
-        requests: All requests of a frame.
-        room: For each kind, how many slots may be taken, coarse ones separately: see `Cache.room`.
+    All requests of a frame are moved up the tree, the deepest first, until they name at most as
+    many nodes as there are slots; `room` is from `Cache.room`.
 
     Returns:
         The subdivisions as they are, and loads of the coarser nodes; or `requests` unchanged if
@@ -220,21 +212,16 @@ class CallCost:
     """
 
     def __init__(self) -> None:
-        """Starts without any call."""
         self.largest, self._calls = 0.0, 0
-        self._weight = self._items = self._time = self._squares = self._products = 0.0
+        self._sums = [0.0] * 5  # of weights; and of items, time, items^2, items * time, by weight
 
     def learn(self, items: int, milliseconds: float) -> None:
         """Adds one call to the running estimate."""
         self._calls += 1
         if self._calls == 2:
-            self._weight = self._items = self._time = self._squares = self._products = 0.0
+            self._sums = [0.0] * 5
         new = (1, items, milliseconds, items * items, items * milliseconds)
-        old = (self._weight, self._items, self._time, self._squares, self._products)
-        updated = [
-            before + _NEWEST_WEIGHT * (n - before) for before, n in zip(old, new, strict=True)
-        ]
-        self._weight, self._items, self._time, self._squares, self._products = updated
+        self._sums = [a + _NEWEST_WEIGHT * (b - a) for a, b in zip(self._sums, new, strict=True)]
         self.largest = max(float(items), (1 - _NEWEST_WEIGHT) * self.largest)
 
     def fitting(self, milliseconds: float, default: int) -> int:
@@ -245,24 +232,26 @@ class CallCost:
         small calls would take longer. If all calls had about the same number of items, a few more
         are tried: the line cannot be fitted otherwise.
         """
-        if not self._weight:
+        weight, items, *_ = self._sums
+        if not weight:
             return default
         overhead, per_item, is_fitted = self._fitted_line()
         fitting = max(1.0, max(milliseconds - overhead, 0.5 * milliseconds) / per_item)
-        mean = self._items / self._weight
+        mean = items / weight
         if not is_fitted and abs(fitting - mean) <= _MIN_SPREAD * mean:
             fitting = max(fitting + 1, _PROBE_FACTOR * fitting)
         return int(min(fitting, max(2 * self.largest, 2.0)))
 
     def _fitted_line(self) -> tuple[float, float, bool]:
         """Returns the time of a call itself and of each item, and whether both could be fitted."""
-        items, time = self._items / self._weight, self._time / self._weight
-        spread = self._squares / self._weight - items * items
+        weight, *sums = self._sums
+        items, time, squares, products = (value / weight for value in sums)
+        spread = squares - items * items
         is_fitted = spread > (_MIN_SPREAD * items) ** 2
         max_per_item = time / items
         if not is_fitted:
             return 0.0, max_per_item, is_fitted
-        slope = (self._products / self._weight - items * time) / spread
+        slope = (products - items * time) / spread
         per_item = min(max(slope, _MIN_ITEM_FRACTION * max_per_item), max_per_item)
         return time - per_item * items, per_item, is_fitted
 

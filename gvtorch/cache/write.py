@@ -35,11 +35,9 @@ class Targets:
     loc: Tensor  # (k, 4) x, y, z, depth
 
     def __len__(self) -> int:
-        """Number of nodes."""
         return len(self.node)
 
     def __getitem__(self, index: slice | Tensor) -> Targets:
-        """Returns some of the nodes."""
         return Targets(self.tree, self.node[index], self.loc[index])
 
     def lacking(self, cache: Cache, kind: int) -> Tensor:
@@ -49,9 +47,8 @@ class Targets:
         pool, tree = cache.nodes, self.tree
         words = pool.brick_tn if kind == REQUEST_LOAD else pool.child_tn
         tile_fields = pool.loc_t4, pool.parent_t, pool.tree_t, pool.shared_t
-        return lacking(
-            words, *tile_fields, self.node, self.loc, tree.number, tree.root, tree.branching
-        )
+        tree_numbers = tree.number, tree.root, tree.branching
+        return lacking(words, *tile_fields, self.node, self.loc, *tree_numbers)
 
 
 @dataclass
@@ -157,10 +154,9 @@ def write_rows(pool_rows: Tensor, slot: Tensor, rows: Tensor) -> None:
     be shorter than a slot.
     """
     target_bytes, source_bytes = _as_bytes(pool_rows), _as_bytes(rows.to(pool_rows.dtype))
-    if source_bytes.shape[1] < target_bytes.shape[1]:
-        source_bytes = torch.nn.functional.pad(
-            source_bytes, (0, target_bytes.shape[1] - source_bytes.shape[1])
-        )
+    lacking_bytes = target_bytes.shape[1] - source_bytes.shape[1]
+    if lacking_bytes > 0:
+        source_bytes = torch.nn.functional.pad(source_bytes, (0, lacking_bytes))
     put_rows(target_bytes, slot, source_bytes)
 
 
@@ -188,15 +184,9 @@ def put_bricks(
     free: Tensor,
     coarse: bool = False,
 ) -> WriteOutcome:
-    """Gives (k,) nodes, index -1 left out, their bricks: takes at most `free` (1,) slots, unlinks,
-    writes and links them. The host does not wait.
-
-    Args:
-        cache: The pools.
-        targets: The nodes.
-        data: For each channel (k, z, y, x, c), or chunks on their way to the device.
-        free: How many slots may be taken.
-        coarse: Whether they get coarse slots.
+    """Gives (k,) nodes, index -1 left out, their bricks: takes at most `free` (1,) slots, coarse
+    ones if `coarse`, unlinks, writes and links them. `data` is for each channel (k, z, y, x, c), or
+    chunks on their way to the device. The host does not wait.
     """
     wanted = targets.lacking(cache, REQUEST_LOAD)
     slot = cache.lru[REQUEST_LOAD][coarse].give(wanted, free)

@@ -73,10 +73,8 @@ class DeviceFrame(RecordedFrame):
     def _count_levels(self) -> Tensor:
         if self._production.by_level:
             return super()._count_levels()
-        request_word = self._requests[:, 1].flatten()
-        priority = torch.where(
-            (request_word & REQUEST_SUBDIVIDE) != 0, request_word & REQUEST_PRIORITY, -1
-        )
+        word = self._requests[:, 1].flatten()
+        priority = torch.where((word & REQUEST_SUBDIVIDE) != 0, word & REQUEST_PRIORITY, -1)
         branching = max(source.layout.branching for source in self.trees)
         return levels_wanted(priority, branching)
 
@@ -97,11 +95,9 @@ class DeviceFrame(RecordedFrame):
         """Subdivides nodes (batch,), and lists the children to subdivide next, in order."""
         slot, child_priority = torch.full_like(chosen, -1), torch.zeros_like(chosen)
         for answer in answers:
-            in_tree, source = answer.node >= 0, answer.batch.source
+            in_tree, branching = answer.node >= 0, answer.batch.source.layout.branching
             slot = torch.where(in_tree, self._write_tiles(answer), slot)
-            child_priority = torch.where(
-                in_tree, priority // source.layout.branching, child_priority
-            )
+            child_priority = torch.where(in_tree, priority // branching, child_priority)
         node, split = nodes_to_subdivide(self.cache, slot, child_priority, self._tiles.unused)
         rank = split.flatten().cumsum(0)
         rows = torch.stack((node, child_priority[:, None].expand_as(node)), 2).flatten(0, 1)
@@ -111,8 +107,8 @@ class DeviceFrame(RecordedFrame):
 
     def _write_bricks(self, unchecked: UncheckedAnswer) -> None:
         """Checks bricks, writes them, and counts what was written and what failed."""
-        node, batch, fill_answer = unchecked
-        bricks = checked_bricks(fill_answer, batch.nodes, batch.source.producer, check_values=False)
+        node, batch, answer = unchecked
+        bricks = checked_bricks(answer, batch.nodes, batch.source.producer, check_values=False)
         valid = _finite([bricks.data, bricks.constants], len(node), node.device)
         has_data = valid
         if bricks.kind is not None:
@@ -130,10 +126,8 @@ class DeviceFrame(RecordedFrame):
         """Checks regions, writes tiles, and counts what was written and what failed; returns the
         tiles (k,), -1 for none.
         """
-        node, batch, classify_answer = unchecked
-        regions = checked_regions(
-            classify_answer, batch.nodes, batch.source.producer, check_values=False
-        )
+        node, batch, answer = unchecked
+        regions = checked_regions(answer, batch.nodes, batch.source.producer, check_values=False)
         count = len(regions.kind)
         valid = _finite([regions.constants, regions.ranges], count, node.device)
         valid = valid & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)

@@ -133,9 +133,7 @@ class Engine(FrameSteps):
         """Checks the arguments of `frame`, and returns its view. Errors begin with `context`."""
         camera = as_camera(context, camera)
         chosen = render_options(context, options, camera)
-        scene = {
-            name: (source.tree, source.producer.channels) for name, source in self.trees.items()
-        }
+        scene = {name: (s.tree, s.producer.channels) for name, s in self.trees.items()}
         by_level, frame_1 = self.production.by_level, self.cache.frame_1
         trees = tree_traces(context, scene, shader, chosen, by_level=by_level, frame_1=frame_1)
         return View.of(camera, trees, chosen)
@@ -209,12 +207,11 @@ class Engine(FrameSteps):
         if missed is not None and len(missed) == view.ray_count:
             # If no ray missed anything, this picture will hardly miss anything.
             scouts_first = scouts_first and bool(missed.any())
-        subsets = RaySubsets(
-            view.ray_count, view.camera.width, self.device, scouts_first=scouts_first
-        )
+        count, width = view.ray_count, view.camera.width
+        subsets = RaySubsets(count, width, self.device, scouts_first=scouts_first)
         total, again = FrameStats(), None
         if scouts_first:
-            again = empty_hits(self.device, view.options.dtype, view.ray_count), subsets.next
+            again = empty_hits(self.device, view.options.dtype, count), subsets.next
         for frame_count in range(1, max_frames + 1):
             hits, stats = self._served_frame(view, again)
             subsets.update(hits.missed, stats, total.failed)
@@ -282,12 +279,8 @@ class Engine(FrameSteps):
             ProductionError: See `frame`.
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
-        if any(
-            isinstance(tree_shader, Shader) and tree_shader.uses_torch for tree_shader in shaders
-        ):
-            raise ValueError(
-                "Engine.capture: a ModuleShader can't be recorded: the host waits in it"
-            )
+        if any(isinstance(each, Shader) and each.uses_torch for each in shaders):
+            raise ValueError("Engine.capture: a ModuleShader can't be recorded: the host waits")
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         view = self.view("capture", camera, shader, options)

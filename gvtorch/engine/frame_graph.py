@@ -104,7 +104,6 @@ class FrameGraph:
             return self._replay(camera)
 
     def _replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
-        """See `replay`."""
         engine, recorded, collected = self._engine, self._recorded, self._collected
         if engine.changed or (recorded and recorded.take_host_needed(engine.readbacks)):
             return self._render_frame(camera)  # which also renews the changed trees
@@ -188,9 +187,8 @@ class LookAhead:
         return self._view.hits()
 
     def _numbers_ahead(self) -> Tensor:
-        return self._camera.numbers_ahead(
-            self._numbers, self._numbers_before, self._frames, _STRIDE
-        )
+        now, before = self._numbers, self._numbers_before
+        return self._camera.numbers_ahead(now, before, self._frames, _STRIDE)
 
 
 @contextmanager

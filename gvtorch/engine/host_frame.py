@@ -64,9 +64,8 @@ class HostFrame(RecordedFrame):
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
         super().__init__(production, batch, fit)
         device = self._unused_slots.device
-        self._uploads = [
-            UploadQueue(_table_forms(self.cache, source), batch, device) for source in self.trees
-        ]
+        forms = [_table_forms(self.cache, source) for source in self.trees]
+        self._uploads = [UploadQueue(form, batch, device) for form in forms]
         self._upload_index = {source.tree.number: index for index, source in enumerate(self.trees)}
         self.generation = 0  # counts releases: answers to requests of an earlier one are dropped
         # Nodes asked for, and failed, since the last `release`.
@@ -82,10 +81,8 @@ class HostFrame(RecordedFrame):
     @property
     def pending(self) -> int:
         """Number of nodes whose answers are on their way."""
-        return max(
-            0,
-            self._asked_count - self._failed_count - sum(queue.sent for queue in self._uploads),
-        )
+        sent_count = sum(queue.sent for queue in self._uploads)
+        return max(0, self._asked_count - self._failed_count - sent_count)
 
     def begin(self, stale: bool, steady: bool, stats: FrameStats) -> bool:
         """Sends the answers that were queued, and returns whether there are any; see
@@ -173,14 +170,12 @@ class HostFrame(RecordedFrame):
             alias=None,
             alias_tree=source.tree.number,
         )
-        targets = [
-            Targets(source.tree, table["node"], table["loc"]) for table in (tiles, bricks, uniform)
-        ]
+        tables = tiles, bricks, uniform
+        targets = [Targets(source.tree, table["node"], table["loc"]) for table in tables]
         outcome = put_tiles(self.cache, targets[0], children, self._tiles.unused)
         self._count_outcome(REQUEST_SUBDIVIDE, self._tiles, targets[0], outcome)
-        outcome = put_bricks(
-            self.cache, targets[1], _by_channel(bricks, "data"), self._bricks.unused
-        )
+        data = _by_channel(bricks, "data")
+        outcome = put_bricks(self.cache, targets[1], data, self._bricks.unused)
         self._count_outcome(REQUEST_LOAD, self._bricks, targets[1], outcome)
         constants = _by_channel(uniform, "constants")
         self._uniform_nodes.add_(put_uniform(self.cache, targets[2], uniform["word"], constants))
@@ -242,9 +237,8 @@ class HostFrame(RecordedFrame):
             for source in self.trees:
                 tree_rows = rows[rows[:, 1] == source.tree.number]
                 if len(tree_rows):
-                    targets = Targets(
-                        source.tree, tree_rows[:, 0].clone(), tree_rows[:, 2:].clone()
-                    )
+                    node, loc = tree_rows[:, 0].clone(), tree_rows[:, 2:].clone()
+                    targets = Targets(source.tree, node, loc)
                     self._submit(RequestBatch(source, kind, targets, generation=generation))
 
     def _submit(self, batch: RequestBatch) -> None:
@@ -295,7 +289,7 @@ class HostFrame(RecordedFrame):
         else:
             self._queue_bricks(valid_batch, checked)
 
-    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         with self._lock:
             if batch.generation == self.generation:
@@ -307,39 +301,33 @@ class HostFrame(RecordedFrame):
             self._leave_to_host(batch)
             return
         children, targets = children_of(batch, answer, self.cache), batch.targets
-        rows = {
-            "node": targets.node,
-            "loc": targets.loc,
-            "child": children.child,
-            "brick": children.brick,
-        }
+        rows = {"node": targets.node, "loc": targets.loc}
+        words = {"child": children.child, "brick": children.brick}
         fields = {"constants": children.constants, "ranges": children.ranges}
-        self._queue(batch, "tiles", rows, fields)
+        self._queue(batch, "tiles", rows | words, fields)
 
     def _queue_bricks(self, batch: RequestBatch, answer: Bricks) -> None:
-        fields: dict[str, Mapping[str, Any]]
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
         data = {
             name: voxels.gather() if isinstance(voxels, TableRows) else voxels
             for name, voxels in answer.data.items()
         }
-        fields = {"data": data}
         if kind is None:
-            self._queue(batch, "bricks", rows, fields)
+            self._queue(batch, "bricks", rows, {"data": data})
             return
         is_alias = kind == Region.ALIAS
         if bool(is_alias.any()):
             self._leave_to_host(batch[is_alias])
         brick_word = brick_words(kind)
         is_uniform = brick_word != ABSENT
-        self._queue(batch, "bricks", rows, fields, ~is_uniform & ~is_alias)
+        self._queue(batch, "bricks", rows, {"data": data}, ~is_uniform & ~is_alias)
         zeros = {
             name: torch.zeros((len(kind), channel.width), dtype=channel.dtype, device="cpu")
             for name, channel in batch.source.producer.channels.items()
         }
-        fields = {"constants": {**zeros, **answer.constants}}
-        self._queue(batch, "uniform", {**rows, "word": brick_word}, fields, is_uniform)
+        constants = {"constants": {**zeros, **answer.constants}}
+        self._queue(batch, "uniform", {**rows, "word": brick_word}, constants, is_uniform)
 
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
@@ -378,32 +366,17 @@ class HostFrame(RecordedFrame):
 
 def _table_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:
     """Returns the tables of a tree's answers, and the fields of their rows."""
-    word_dtype, loc_field = torch.int32, {"loc": ((4,), torch.int64)}
-    channels, child_count = source.producer.channels, source.layout.branching**3
-    pool_channels = cache.bricks.channels
-    tiles: dict[str, Any] = {
-        "child": ((child_count,), word_dtype),
-        "brick": ((child_count,), word_dtype),
-    }
-    for name, channel in pool_channels.items():
-        tiles[f"constants.{name}"] = ((child_count, channel.width), channel.dtype)
-        tiles[f"ranges.{name}"] = ((child_count, 2, channel.width), channel.dtype)
-    brick = (source.layout.side,) * 3
-    return {
-        "tiles": loc_field | tiles,
-        "bricks": loc_field
-        | {
-            f"data.{name}": ((*brick, channel.width), channel.dtype)
-            for name, channel in channels.items()
-        },
-        "uniform": loc_field
-        | {"word": ((), word_dtype)}
-        | {
-            f"constants.{name}": ((channel.width,), channel.dtype)
-            for name, channel in channels.items()
-        },
-        "to_host": {"bit": ((), word_dtype)},
-    }
+    n, brick, word = source.layout.branching**3, (source.layout.side,) * 3, torch.int32
+    loc: dict[str, Any] = {"loc": ((4,), torch.int64)}
+    tiles = loc | {"child": ((n,), word), "brick": ((n,), word)}
+    for name, channel in cache.bricks.channels.items():
+        tiles[f"constants.{name}"] = ((n, channel.width), channel.dtype)
+        tiles[f"ranges.{name}"] = ((n, 2, channel.width), channel.dtype)
+    bricks, uniform = dict(loc), loc | {"word": ((), word)}
+    for name, channel in source.producer.channels.items():
+        bricks[f"data.{name}"] = ((*brick, channel.width), channel.dtype)
+        uniform[f"constants.{name}"] = ((channel.width,), channel.dtype)
+    return {"tiles": tiles, "bricks": bricks, "uniform": uniform, "to_host": {"bit": ((), word)}}
 
 
 def _by_channel(table: Mapping[str, Tensor], field: str) -> dict[str, Tensor]:

@@ -59,7 +59,6 @@ class Failure:
     message: str
 
     def __str__(self) -> str:
-        """Names tree, level, node and reason in one line."""
         *xyz, depth = self.loc
         return f"tree {self.tree!r}, depth {depth}, node {tuple(xyz)}, {self.kind}: {self.message}"
 
@@ -305,9 +304,7 @@ class Production:
         for item in [item for item in self._waiting if item.batch.source is source]:
             item.producer_future.cancel()
             self._waiting.remove(item)
-        self._held_back = [
-            answered for answered in self._held_back if answered.batch.source is not source
-        ]
+        self._held_back = [item for item in self._held_back if item.batch.source is not source]
         self.failures.forget(source.name)
 
     def close(self) -> None:
@@ -350,7 +347,7 @@ class Production:
         if failed is not None:
             unfillable = (failed & (node != batch.targets.node)).nonzero()[:, 0]
             if len(unfillable):
-                self._fail(batch[unfillable], "the brick of its parent can't be made")
+                self._fail(batch[unfillable], "the brick of its parent can't be made", None)
         to_load = parents.without_repeats(torch.where(pending, -1, node))
         load_batch = ancestors[(to_load >= 0).nonzero()[:, 0]]
         bricks = parents.parent_bricks(cache, source, load_batch.targets.node)
@@ -401,23 +398,21 @@ class Production:
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
     ) -> None:
         """Writes an answer to loads whose items are written alike; see `by_kind`."""
+        targets, device = batch.targets, batch.targets.node.device
         if kind is Region.ALIAS:
-            goal = upload(answer.alias, batch.targets.node.device)
-            written = write.aliases(self.cache, batch.targets, goal, batch.alias_tree(answer))
-            self._count_written(batch, written, stats)
-            return
-        if kind is Region.EMPTY:
-            device = batch.targets.node.device
+            goal = upload(answer.alias, device)
+            written = write.aliases(self.cache, targets, goal, batch.alias_tree(answer))
+        elif kind is Region.EMPTY:
             brick_word = upload(brick_words(answer.kind), device)
             constants = {name: upload(rows, device) for name, rows in answer.constants.items()}
-            written = write.uniform(self.cache, batch.targets, brick_word, constants)
-            self._count_written(batch, written, stats)
-            return
-        sent = send_voxels(batch, answer, self.staging)
-        if isinstance(sent, SentBricks):
-            self._write_sent(batch, sent, stats)
+            written = write.uniform(self.cache, targets, brick_word, constants)
         else:
-            self._count_written(batch, write.bricks(self.cache, batch.targets, answer.data), stats)
+            sent = send_voxels(batch, answer, self.staging)
+            if isinstance(sent, SentBricks):
+                self._write_sent(batch, sent, stats)
+                return
+            written = write.bricks(self.cache, targets, answer.data)
+        self._count_written(batch, written, stats)
 
     def _write_sent(self, batch: RequestBatch, bricks: SentBricks, stats: FrameStats) -> None:
         """Writes the bricks that are being sent to the device; holds back those without room."""
@@ -448,7 +443,7 @@ class Production:
         lacking = batch.targets.lacking(self.cache, batch.kind)
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 
-    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None = None) -> None:
+    def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
         """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         self._mark(batch)
         self.failures.add(batch, message, cause)

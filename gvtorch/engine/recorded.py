@@ -44,7 +44,6 @@ class SlotCounts(NamedTuple):
     evicted: Tensor  # of these, the slots that held something else
 
     def add(self, outcome: WriteOutcome) -> None:
-        """Counts a write."""
         _, placed, evicted = outcome.counts
         self.unused.sub_(placed)
         self.made.add_(placed)
@@ -144,15 +143,9 @@ class RecordedFrame(ABC):
         if self._looks_ahead:
             used.copy_(self._picture_use)
             ahead_count = (self._requests[1, 1] & REQUEST_KINDS).count_nonzero().view(1)
-        counts = (
-            self._listed.count,
-            use,
-            samples,
-            self._outcomes,
-            ahead_count,
-            self._count_levels(),
-        )
-        numbers = torch.cat((*counts, (self._cone_factor * COARSER_UNIT).to(torch.int64)))
+        coarser = (self._cone_factor * COARSER_UNIT).to(torch.int64)
+        counts = (self._listed.count, use, samples, self._outcomes)  # in the order of `Counts`
+        numbers = torch.cat((*counts, ahead_count, self._count_levels(), coarser))
         if self._fit:
             self._widen_cones(used, self._listed.count)
         self._outcomes.zero_()
@@ -174,9 +167,7 @@ class RecordedFrame(ABC):
         needed_bricks = (bricks_used + missed_nodes) / self.cache.bricks.capacity
         needed_tiles = (tiles_used + subdivisions) / self.cache.nodes.capacity
         needed = torch.stack((needed_bricks, needed_tiles)).amax()
-        wider = self._cone_factor * torch.where(
-            needed > 1, needed.sqrt().clamp(max=_MAX_WIDENING), 1.0
-        )
+        wider = self._cone_factor * needed.sqrt().clamp(1.0, _MAX_WIDENING)
         narrower = torch.where(needed < _ROOMY_FRACTION, self._cone_factor * _NARROWING, wider)
         self._cone_factor.copy_(narrower.clamp(1.0, _MAX_CONE_FACTOR))
 

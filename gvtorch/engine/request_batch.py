@@ -140,7 +140,6 @@ class RequestBatch:
         return self.source.tree.number if name is None else [*layout.scene].index(name)
 
     def ask(self) -> Any:
-        """Calls the producer."""
         producer = self.source.producer
         producer_call = producer.fill if self.kind == REQUEST_LOAD else producer.classify
         return producer_call(self.nodes)

@@ -91,8 +91,7 @@ class EngineOptions:
             time_budget=time_budget,
         )
         for name in ("strict", "monitor"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"Engine: {name} must be bool, got {getattr(self, name)!r}")
+            check.instance(context, name, getattr(self, name), bool)
 
 
 class EngineSettings(TypedDict, total=False):
@@ -140,45 +139,33 @@ def make_pools(
     bricks = _count_slots(
         "brick_pool", options.brick_pool, fine_nbytes, max(roots, coarse) + 1, coarse_nbytes
     )
-    _check_memory(
-        producers,
-        tiles,
-        tiles * tile_nbytes,
-        bricks,
-        bricks * fine_nbytes + coarse_nbytes,
-        branching,
-        device,
-    )
+    parts = {
+        "node_pool": tiles * tile_nbytes,
+        "brick_pool": bricks * fine_nbytes + coarse_nbytes,
+        "their bookkeeping": tiles * (_TILE_BYTES + 2 * branching**3) + bricks * _BRICK_BYTES,
+    }
+    _check_memory(parts, sum(producer.host_bytes for producer in producers.values()), device)
     nodes = NodePool(tiles, channels, branching=branching, device=device)
     shape = {"brick_size": options.brick_size, "border": options.border, "coarse": coarse}
     return nodes, BrickPool(bricks, channels, **shape, device=device)
 
 
-def _check_memory(
-    producers: Mapping[str, Producer],
-    tiles: int,
-    node_bytes: int,
-    bricks: int,
-    brick_bytes: int,
-    branching: int,
-    device: torch.device,
-) -> None:
-    """Raises ValueError if an engine would take more memory than is free."""
-    bookkeeping = tiles * (_TILE_BYTES + 2 * branching**3) + bricks * _BRICK_BYTES
-    cache_nbytes = sum(producer.host_bytes for producer in producers.values())
-    parts = {"node_pool": node_bytes, "brick_pool": brick_bytes, "their bookkeeping": bookkeeping}
-    needs = [(device, parts), (torch.device("cpu"), {"host caches": cache_nbytes})]
+def _check_memory(parts: dict[str, int], cache_nbytes: int, device: torch.device) -> None:
+    """Raises ValueError if the device lacks memory for the pools, whose `parts` take these bytes,
+    or the host for the producers' caches.
+    """
+    host_parts = {"host caches": cache_nbytes}
+    needs = [(device, parts), (torch.device("cpu"), host_parts)]
     if device.type == "cpu":
-        needs = [(device, parts | {"host caches": cache_nbytes})]
+        needs = [(device, parts | host_parts)]
     for memory_device, needed in needs:
         cuda = memory_device.type == "cuda"
         free = torch.cuda.mem_get_info(memory_device)[0] if cuda else memory_free()
         if sum(needed.values()) > free:
             listing = ", ".join(f"{name} {amount(size)}" for name, size in needed.items() if size)
             total = amount(sum(needed.values()))
-            raise ValueError(
-                f"Engine: {listing} take {total}, {memory_device} has {amount(free)} free"
-            )
+            has = f"{memory_device} has {amount(free)} free"
+            raise ValueError(f"Engine: {listing} take {total}, {has}")
 
 
 def _count_slots(

@@ -314,9 +314,8 @@ class Readbacks(deque[Readback]):
         self._steady = readback.converged()
         counts = readback.wait()
         self.failed = counts.failed > 0
-        self.extra_levels = extra_levels(
-            (counts.subdivisions, counts.one_deeper, counts.two_deeper)
-        )
+        wanted = counts.subdivisions, counts.one_deeper, counts.two_deeper
+        self.extra_levels = extra_levels(wanted)
         readback.stats.settle()
         return readback
 
@@ -357,7 +356,6 @@ class Report:
         }
 
     def __rich__(self) -> Any:
-        """Returns the table that rich prints."""
         from rich.table import Table
 
         content = self.as_dict()
@@ -379,7 +377,6 @@ class Report:
         return f"Report({len(self.frames)} frames)"
 
     def __str__(self) -> str:
-        """Shows the table as plain text."""
         from rich.console import Console
 
         console = Console(width=60, color_system=None)

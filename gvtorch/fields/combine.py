@@ -64,9 +64,8 @@ class Warp(Field):
             got = check.describe(displacement)
             raise ValueError(f"Warp: offset must give (..., 3) at (..., 3) points, got {got}")
         magnitude = torch.linalg.vector_norm(displacement, dim=-1, keepdim=True)
-        return self.field(
-            points + displacement * (self.max_offset / magnitude.clamp(min=1e-30)).clamp(max=1)
-        )
+        scale = (self.max_offset / magnitude.clamp(min=1e-30)).clamp(max=1)
+        return self.field(points + displacement * scale)
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
         return _bounds_of(self.field, center, half + self.max_offset, None)
@@ -101,9 +100,7 @@ class Stack(Field):
 
     def filtered(self, points: Tensor, size: Tensor) -> Mapping[str, Tensor]:
         """Returns means; fields that are not prefiltered are evaluated at the voxels' centres."""
-        return _flatten(
-            {name: _evaluate(field, points, size) for name, field in self.fields.items()}
-        )
+        return _flatten({n: _evaluate(field, points, size) for n, field in self.fields.items()})
 
     def bounds(self, center: Tensor, half: Tensor) -> Mapping[str, Interval]:
         return self.filtered_bounds(center, half, None)
@@ -111,10 +108,8 @@ class Stack(Field):
     def filtered_bounds(
         self, center: Tensor, half: Tensor, size: Tensor | None
     ) -> Mapping[str, Interval]:
-        intervals = {n: _bounds_of(field, center, half, size) for n, field in self.fields.items()}
-        return _flatten(
-            {name: interval for name, interval in intervals.items() if interval is not None}
-        )
+        bounds = {n: _bounds_of(field, center, half, size) for n, field in self.fields.items()}
+        return _flatten({n: known for n, known in bounds.items() if known is not None})
 
     def near(self, center: Tensor, half: Tensor) -> Self:
         parts = {name: _reduce(field, center, half) for name, field in self.fields.items()}
@@ -153,9 +148,7 @@ class Blend(Field):
             if first.keys() != second.keys():
                 names = f"{', '.join(first)} and {', '.join(second)}"
                 raise ValueError(f"Blend: both fields must have the same channels, got {names}")
-            return {
-                name: _mix_values(values, second[name], fraction) for name, values in first.items()
-            }
+            return {name: _mix_values(v, second[name], fraction) for name, v in first.items()}
         return _mix_values(_only_channel(first), _only_channel(second), fraction)
 
     def bounds(self, center: Tensor, half: Tensor) -> Bounds:
@@ -215,10 +208,7 @@ class Mask(Blend):
             infinity = torch.full_like(center[:, 0], torch.inf)
             field_bounds = (-infinity, infinity)
         if isinstance(field_bounds, Mapping):
-            return {
-                n: between(_zero(interval), interval, low, high)
-                for n, interval in field_bounds.items()
-            }
+            return {n: between(_zero(ends), ends, low, high) for n, ends in field_bounds.items()}
         return between(_zero(field_bounds), field_bounds, low, high)
 
 
@@ -276,10 +266,9 @@ def _flatten(by_name: Mapping[str, Any]) -> dict[str, Any]:
     """Flattens channels within channels: {"a": {"b": x}} becomes {"a_b": x}."""
     flat: dict[str, Any] = {}
     for name, values in by_name.items():
-        inner = (
-            {f"_{n}": v for n, v in values.items()} if isinstance(values, Mapping) else {"": values}
-        )
-        channels = {name + suffix: value for suffix, value in inner.items()}
+        channels = {name: values}
+        if isinstance(values, Mapping):
+            channels = {f"{name}_{inner}": value for inner, value in values.items()}
         if taken := flat.keys() & channels.keys():
             raise ValueError(f"Stack: two channels are named {min(taken)!r}")
         flat |= channels

@@ -135,9 +135,8 @@ class Pair(Distance):
 
     def bounds(self, center: Tensor, half: Tensor) -> Interval:
         """Combines the ends of both intervals, which is right because `mix` never decreases."""
-        low, high = zip(
-            self.first.bounds(center, half), self.second.bounds(center, half), strict=True
-        )
+        bounds = (part.bounds(center, half) for part in (self.first, self.second))
+        low, high = zip(*bounds, strict=True)
         return self.mix(*low)[0], self.mix(*high)[0]
 
     def colors(self, center: Tensor, half: Tensor) -> Interval:

@@ -215,12 +215,9 @@ def parts_of(center: Tensor, half: Tensor, count: int) -> tuple[Tensor, Tensor]:
     (k * count^3, 3) each, box after box. Intervals of small boxes are tighter than that of a large
     one; `joined` combines them to those of the boxes.
     """
-    axis_offsets = (
-        torch.arange(count, device=center.device, dtype=center.dtype) + 0.5
-    ) * 2 / count - 1
-    offsets = torch.stack(
-        torch.meshgrid(axis_offsets, axis_offsets, axis_offsets, indexing="ij"), -1
-    ).view(1, -1, 3)
+    steps = torch.arange(count, device=center.device, dtype=center.dtype)
+    axis_offsets = (steps + 0.5) * 2 / count - 1
+    offsets = torch.cartesian_prod(axis_offsets, axis_offsets, axis_offsets)
     parts = (center[:, None] + half[:, None] * offsets).flatten(0, 1)
     return parts, (half / count).repeat_interleave(count**3, 0)
 

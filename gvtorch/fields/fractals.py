@@ -152,12 +152,10 @@ class Fractal(Distance):
     def surface(self, points: Tensor) -> tuple[Tensor, Tensor]:
         value, origin_distance, plane_distance = self._orbits(points)
         origin_color, plane_color, base_color = self.colors_33.to(points)
-        color = torch.lerp(
-            base_color, plane_color, (1 - plane_distance[..., None]).clamp(0, 1) ** 4
-        )
-        return value, torch.lerp(
-            color, origin_color, (1.2 - origin_distance[..., None]).clamp(0, 1) ** 2
-        )
+        near_plane = (1 - plane_distance[..., None]).clamp(0, 1) ** 4
+        near_origin = (1.2 - origin_distance[..., None]).clamp(0, 1) ** 2
+        color = torch.lerp(base_color, plane_color, near_plane)
+        return value, torch.lerp(color, origin_color, near_origin)
 
     def _orbits(self, points: Tensor) -> Tensor:
         """Returns (3, ...) distances, and least distances of orbits to origin and axis planes."""
@@ -222,9 +220,8 @@ class Fractal(Distance):
 
     def _cube(self, half_side: float) -> Tensor:
         """Returns the box (2, 3) of a cube around the origin."""
-        ends = torch.tensor(
-            (-half_side, half_side), dtype=torch.float64, device=self.colors_33.device
-        )
+        device = self.colors_33.device
+        ends = torch.tensor((-half_side, half_side), dtype=torch.float64, device=device)
         return ends[:, None].expand(2, 3)
 
 
@@ -269,10 +266,8 @@ class Julia(Fractal):
         radius = max(1.0, math.floor(constant_norm ** (1 / power)))  # not yet large enough
         while radius**power - constant_norm <= radius:
             radius += 1 / 64
-        growth = power * radius ** (power - 1)
-        return self._cube(
-            self._escape_radius(radius, growth, gain=radius**power - constant_norm - radius)
-        )
+        growth, gain = power * radius ** (power - 1), radius**power - constant_norm - radius
+        return self._cube(self._escape_radius(radius, growth, gain))
 
 
 class Mandelbox(Fractal):

@@ -110,10 +110,9 @@ class SampledDistance(Distance):
 
     def forward(self, points: Tensor) -> Tensor:
         position = (points - self.origin.to(points)) / self.spacing.to(points)
-        clamped = position.clamp(
-            min=torch.zeros_like(self.last).to(position), max=self.last.to(position)
-        )
-        cell = torch.minimum(clamped.floor(), self.last.to(position) - 1)
+        last = self.last.to(position)
+        clamped = position.clamp(min=torch.zeros_like(last), max=last)
+        cell = torch.minimum(clamped.floor(), last - 1)
         weights = clamped - cell
         _, y, x = self.values.shape
         base_index = cell.nan_to_num().to(torch.int64)  # where a point is NaN, so is the value
@@ -186,10 +185,9 @@ def _apart(values: Tensor, spacing: Tensor) -> Tensor:
             continue
         start_slices = [slice(max(-n, 0), min(-n, 0) or None) for n in step[::-1]]
         end_slices = [slice(max(n, 0), min(n, 0) or None) for n in step[::-1]]
-        difference = (
-            (values[tuple(start_slices)] - values[tuple(end_slices)]).abs().amax().to(torch.float64)
-        )
-        steepest = torch.maximum(steepest, difference / length(spacing.new_tensor(step) * spacing))
+        difference = (values[tuple(start_slices)] - values[tuple(end_slices)]).abs().amax()
+        distance = length(spacing.new_tensor(step) * spacing)
+        steepest = torch.maximum(steepest, difference.to(torch.float64) / distance)
     is_cubic = bool((spacing == spacing[0]).all())
     return steepest * (1.1282 if is_cubic else math.sqrt(3))
 

@@ -101,9 +101,8 @@ class Capsule(Distance):
 
     def forward(self, points: Tensor) -> Tensor:
         start, axis = self.start.to(points), (self.end - self.start).to(points)
-        fraction = ((points - start) * axis).sum(-1, keepdim=True) / (axis * axis).sum().clamp(
-            min=1e-30
-        )
+        squared_length = (axis * axis).sum().clamp(min=1e-30)
+        fraction = ((points - start) * axis).sum(-1, keepdim=True) / squared_length
         return length(points - start - fraction.clamp(0, 1) * axis) - self.radius
 
     def box(self) -> Tensor:

@@ -151,9 +151,8 @@ class Twist(Space):
 
     def over(self, center: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
         radius = length(half) * self.stretch(center, half)
-        half_width = torch.minimum(
-            radius, length((center.abs() + half)[:, :2]) + length(center[:, :2])
-        )
+        farthest = length((center.abs() + half)[:, :2]) + length(center[:, :2])
+        half_width = torch.minimum(radius, farthest)
         return self.place(center), torch.stack((half_width, half_width, half[:, 2]), 1)
 
     def stretch(self, center: Tensor, half: Tensor) -> Tensor:
@@ -163,10 +162,8 @@ class Twist(Space):
 
     def around(self, box: Tensor) -> Tensor:
         radius = length(box.abs().amax(0)[:2])
-        low, high = box.unbind(0)
-        return torch.stack(
-            (torch.stack((-radius, -radius, low[2])), torch.stack((radius, radius, high[2])))
-        )
+        sides = torch.stack((-radius, radius))
+        return torch.stack((sides, sides, box[:, 2]), 1)
 
 
 class Repeat(Space):
@@ -188,9 +185,8 @@ class Repeat(Space):
         self.period = self.vector("period", period)
         self._axes = [axis for axis in range(3) if float(self.period[axis]) != 0]
         if bool((self.period < 0).any()) or not self._axes:
-            raise ValueError(
-                f"{context}: period must be >= 0, and > 0 along an axis, got {tuple(period)}"
-            )
+            got = tuple(period)
+            raise ValueError(f"{context}: period must be >= 0, and > 0 along an axis, got {got}")
         box = shape.box()
         beyond = None if box is None else box.abs().amax(0) - self.period / 2
         if beyond is None or bool((beyond[self._axes] > 1e-9).any()):
@@ -199,17 +195,12 @@ class Repeat(Space):
         if count is not None and (not isinstance(count, Sequence) or len(count) != 3):
             raise ValueError(f"{context}: count must be (x, y, z), got {count!r}")
         counts = count or (None,) * 3
-        for axis_count in counts:
-            if (
-                axis_count is not None
-                and check.integer(context, "count", axis_count, low=1) % 2 == 0
-            ):
+        for n in counts:
+            if n is not None and check.integer(context, "count", n, low=1) % 2 == 0:
                 raise ValueError(f"{context}: count must be odd, got {counts}")
         # Whether values are no distances, see `slope`.
         self._jumps = not shape.exact or bool(_cuts(shape))
-        self._max_cell = [
-            math.inf if axis_count is None else (axis_count - 1) // 2 for axis_count in counts
-        ]
+        self._max_cell = [math.inf if n is None else (n - 1) // 2 for n in counts]
 
     def _cells(self, points: Tensor) -> list[Tensor]:
         """Returns points (..., 3) relative to their two nearest cells along each repeated axis."""
@@ -243,12 +234,9 @@ class Repeat(Space):
         """
         slope = super().slope(center, half)
         for axis in self._axes if self._jumps else ():
-            first, last = (
-                (end[:, axis] / self.period[axis])
-                .floor()
-                .clamp(-self._max_cell[axis] - 1, self._max_cell[axis])
-                for end in (center - half, center + half)
-            )
+            period, max_cell = self.period[axis], self._max_cell[axis]
+            cells = ((end[:, axis] / period).floor() for end in (center - half, center + half))
+            first, last = (cell.clamp(-max_cell - 1, max_cell) for cell in cells)
             slope = torch.where(first < last, 1e30, slope)
         return slope
 
@@ -376,9 +364,8 @@ class Revolution(Space):
 
     def around(self, box: Tensor) -> Tensor:
         radius = self.radius + box[:, 0].abs().max()
-        return torch.stack(
-            (torch.stack((-radius, -radius, box[0, 1])), torch.stack((radius, radius, box[1, 1])))
-        )
+        sides = torch.stack((-radius, radius))
+        return torch.stack((sides, sides, box[:, 1]), 1)
 
 
 def _cuts(shape: Distance) -> list[Intersection]:
@@ -412,7 +399,5 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
 
 def scaled(shape: Distance, x: float, y: float | None = None, z: float | None = None) -> Transform:
     """Returns a shape scaled along the axes; y and z are x if left out."""
-    sides = [
-        check.number("scaled", "factor", x if factor is None else factor) for factor in (x, y, z)
-    ]
+    sides = [check.number("scaled", "factor", x if n is None else n) for n in (x, y, z)]
     return Transform(shape, torch.diag(torch.tensor(sides, dtype=torch.float64, device="cpu")))

@@ -56,10 +56,9 @@ def contour(
     cells = tuple(n - 1 for n in samples.shape)
     kind = np.zeros(cells, np.uint8)
     for n in range(8):
-        corner_slices = tuple(
-            slice(n >> bit & 1, (n >> bit & 1) + c) for bit, c in zip((2, 1, 0), cells, strict=True)
-        )
-        kind |= inside[corner_slices].view(np.uint8) << n
+        corner = [n >> bit & 1 for bit in (2, 1, 0)]
+        window = tuple(slice(a, a + count) for a, count in zip(corner, cells, strict=True))
+        kind |= inside[window].view(np.uint8) << n
     crossed_cell = np.argwhere((kind != 0) & (kind != 255))  # (k, 3)
     tables = _tables()
     cell_kind = kind[tuple(crossed_cell.T)]

@@ -58,10 +58,8 @@ def rims(mesh: Mesh) -> tuple[list[Rim], np.ndarray]:
     rim_edges = rim_edges[rank < excess[rim_edges]]
     hole_rims = []
     for loop in _loops(end[rim_edges], begin[rim_edges]):
-        loop_edges = rim_edges[loop]
-        hole_rims.append(
-            Rim(int(part[kept[face[loop_edges[0]]]]), kept[face[loop_edges]], (loop_edges + 1) % 3)
-        )
+        rim_faces = kept[face[rim_edges[loop]]]
+        hole_rims.append(Rim(int(part[rim_faces[0]]), rim_faces, (rim_edges[loop] + 1) % 3))
     return hole_rims, part
 
 
@@ -104,9 +102,9 @@ def warning_of_holes(mesh: Mesh) -> str:
     flipped = facing_away(mesh)
     hole_rims, part = rims(mesh.turned(flipped))
     count = np.bincount(part[kept], minlength=len(mesh.faces))
-    edges = np.bincount(
-        [rim.part for rim in hole_rims], [len(rim.face) for rim in hole_rims], len(mesh.faces)
-    )
+    edges = np.zeros(len(mesh.faces))
+    for rim in hole_rims:
+        edges[rim.part] += len(rim.face)
     nearly = np.flatnonzero((edges > 0) & (edges <= _NEARLY_CLOSED * count))
     holes = sum(rim.part in nearly for rim in hole_rims)
     reasons = []
@@ -146,9 +144,8 @@ def filled(mesh: Mesh) -> Mesh:
     caps = [(rim.part, _cap(mesh, rim, winding)) for rim in hole_rims]
     a, b, c = mesh.corners.transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
-    area = np.bincount(
-        part[in_open_part], 0.5 * np.linalg.norm(cross[in_open_part], axis=1), len(part)
-    )
+    areas = 0.5 * np.linalg.norm(cross[in_open_part], axis=1)
+    area = np.bincount(part[in_open_part], areas, len(part))
     volume = np.zeros(len(part))
     for owner in {rim.part for rim in hole_rims}:
         corners = np.concatenate(
@@ -170,14 +167,12 @@ def _cap(mesh: Mesh, rim: Rim, winding: WindingNumber) -> Mesh:
     middle = rim_points.mean(0)
     spoke = rim_points - middle
     normal = np.cross(spoke, np.roll(spoke, -1, 0)).sum(0)
-    size = np.linalg.norm(normal)
+    size, radius = np.linalg.norm(normal), np.linalg.norm(spoke, axis=1).mean()
     fraction = np.arange(1, _RINGS + 1)[:, None, None] / _RINGS  # 0 at the rim
     inner = middle + spoke * (1 - fraction[:-1])
     points = np.concatenate((inner.reshape(-1, 3), middle[None]))
     if size > 0:
-        points = _on_half_winding(
-            points, normal / size, np.linalg.norm(spoke, axis=1).mean(), winding
-        )
+        points = _on_half_winding(points, normal / size, radius, winding)
     points = np.concatenate((rim_points, points))
     ring = np.arange(_RINGS * n).reshape(_RINGS, n)
     ring = np.concatenate((ring, np.full((1, n), _RINGS * n)))
@@ -231,16 +226,11 @@ def _on_half_winding(
 
 
 def _joined(mesh: Mesh, caps: list[Mesh]) -> Mesh:
-    """Returns the mesh and its caps as one mesh."""
     meshes = [mesh, *caps]
     first = np.cumsum([0, *(len(part.vertices) for part in meshes)])
-
-    def all_of(name: str) -> np.ndarray | None:
-        arrays = [getattr(part, name) for part in meshes]
-        return None if arrays[0] is None else np.concatenate(arrays)
-
     faces = [part.faces + start for part, start in zip(meshes, first, strict=False)]
-    fields: dict[str, Any] = {
-        name: all_of(name) for name in ("vertices", "color", "uv", "material")
-    }
-    return replace(mesh, faces=np.concatenate(faces), **fields)
+    fields: dict[str, Any] = {"faces": np.concatenate(faces)}
+    for name in ("vertices", "color", "uv", "material"):
+        if getattr(mesh, name) is not None:
+            fields[name] = np.concatenate([getattr(part, name) for part in meshes])
+    return replace(mesh, **fields)

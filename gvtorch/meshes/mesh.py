@@ -52,7 +52,6 @@ class Mesh:
     name: str = "mesh"  # for messages
 
     def __post_init__(self) -> None:
-        """Checks and converts the fields."""
         count = None  # of faces, which come first
         for field_name, row_shape, dtype in (
             ("faces", (3,), np.int64),
@@ -82,9 +81,8 @@ class Mesh:
                 n is None or n == m for n, m in zip(shape, value.shape, strict=True)
             )
             if not fits:
-                raise ValueError(
-                    f"{self.name}: {field_name} must be ({expected_shape}), got {value.shape}"
-                )
+                got = value.shape
+                raise ValueError(f"{self.name}: {field_name} must be ({expected_shape}), got {got}")
             vars(self)[field_name] = value
             count = len(self.faces)
         if self.material is None:
@@ -117,10 +115,8 @@ class Mesh:
     def _check_indices(self, kind: str, indices: np.ndarray, count: int) -> None:
         low, high = int(indices.min()), int(indices.max())
         if low < 0 or high >= count:
-            bad_index = low if low < 0 else high
-            raise ValueError(
-                f"{self.name}: a triangle refers to {kind} {bad_index}, there are {count}"
-            )
+            bad = low if low < 0 else high
+            raise ValueError(f"{self.name}: a triangle refers to {kind} {bad}, there are {count}")
 
     @property
     def bounds(self) -> np.ndarray:
@@ -145,12 +141,9 @@ class Mesh:
         corner[which] = (0, 2, 1)
         row = np.arange(len(self.faces))[:, None]
         arrays = {name: getattr(self, name) for name in ("faces", "color", "uv")}
-        return replace(
-            self, **{n: array[row, corner] for n, array in arrays.items() if array is not None}
-        )
+        return replace(self, **{n: a[row, corner] for n, a in arrays.items() if a is not None})
 
     def __repr__(self) -> str:
-        """Returns counts and bounds as text."""
         low, high = (", ".join(f"{n:.6g}" for n in corner) for corner in self.bounds)
         painted = [n for n in ("color", "uv") if getattr(self, n) is not None]
         return (

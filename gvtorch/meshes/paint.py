@@ -126,10 +126,8 @@ def _corner_normals(mesh: Mesh, geometry: Geometry) -> Tensor:
     unit = torch.nn.functional.normalize
     edge = unit(corner.roll(-1, 1) - corner, dim=2)
     angle = torch.acos((edge * -edge.roll(1, 1)).sum(2).clamp(-1, 1))
-    face_normal = unit(
-        torch.linalg.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), dim=1
-    )
-    face_normal = face_normal[:, None].expand(-1, 3, 3)
+    a, b, c = corner.unbind(1)
+    face_normal = unit(torch.linalg.cross(b - a, c - a), dim=1)[:, None].expand(-1, 3, 3)
     sums = face_normal.new_zeros((int(vertex.max()) + 1, 3))
     sums.index_add_(0, vertex.flatten(), (face_normal * angle[..., None]).reshape(-1, 3))
     mean = unit(sums, dim=1)[vertex]

@@ -51,9 +51,8 @@ def check_channels(context: str, channels: str | Sequence[str]) -> tuple[str, ..
     unknown = [name for name in names if name not in CHANNELS]
     if unknown or not names or len({*names}) < len(names):
         rejected = f"{unknown[0]!r}" if unknown else f"{names!r}"
-        raise ValueError(
-            f"{context}: channels must be some of {', '.join(CHANNELS)}, got {rejected}"
-        )
+        known = ", ".join(CHANNELS)
+        raise ValueError(f"{context}: channels must be some of {known}, got {rejected}")
     return names
 
 
@@ -127,12 +126,11 @@ class Voxelizer:
         size = (high - low).max()
         self.mesh, self.channels = mesh, channels
         self.spacing = float(size / (resolution - 2 * _MARGIN_VOXELS))
-        counts = [
-            max(1, math.ceil(n / self.spacing - 1e-9)) + 2 * _MARGIN_VOXELS for n in high - low
-        ]
-        x, y, z = counts
+        counts = (max(1, math.ceil(n / self.spacing - 1e-9)) for n in high - low)
+        x, y, z = (n + 2 * _MARGIN_VOXELS for n in counts)
         self.extent = (x, y, z)
-        middle, half_extent = 0.5 * (low + high), [0.5 * (n - 1) * self.spacing for n in counts]
+        middle = 0.5 * (low + high)
+        half_extent = [0.5 * (n - 1) * self.spacing for n in self.extent]
         x, y, z = (float(m - h) for m, h in zip(middle, half_extent, strict=True))
         self.origin = (x, y, z)
         band = check.number(context, "band", band, low=2, high=_MOST_VOXELS)
@@ -157,9 +155,8 @@ class Voxelizer:
 
     def touched(self, low_k3: Tensor, size_k: Tensor, voxel_k: Tensor) -> tuple[Tensor, Tensor]:
         """Calls `Geometry.touched` with the `reach` of voxels of sizes (k,) float64."""
-        return self.geometry.touched(
-            low_k3, size_k, self.reach(voxel_k), parts=_BLOCK_CUBES, wide=self._wide
-        )
+        reach, wide = self.reach(voxel_k), self._wide
+        return self.geometry.touched(low_k3, size_k, reach, parts=_BLOCK_CUBES, wide=wide)
 
     def cubes(
         self,
@@ -200,9 +197,7 @@ class Voxelizer:
             weight=torch.zeros((*shape, 3), dtype=torch.float32, device=self.device),
         )
         voxels = self._channels(far)
-        return {
-            name: _to_channel_dtype(name, values)[:, 0, 0, 0] for name, values in voxels.items()
-        }
+        return {name: _to_channel_dtype(name, v)[:, 0, 0, 0] for name, v in voxels.items()}
 
     def region(self, low: Sequence[int], high: Sequence[int]) -> dict[str, Tensor]:
         """Computes the finest voxels of a box `low` to `high`, (z, y, x).
@@ -219,10 +214,8 @@ class Voxelizer:
         touched = self.touched(world, block * voxel, voxel)
 
         def joined(values: Tensor) -> Tensor:  # (z, y, x) cubes
-            values = values.view(*count, _BLOCK_CUBES, _BLOCK_CUBES, _BLOCK_CUBES).permute(
-                0, 3, 1, 4, 2, 5
-            )
-            return values.reshape([n * _BLOCK_CUBES for n in count])
+            by_axis = values.view(*count, *(_BLOCK_CUBES,) * 3).permute(0, 3, 1, 4, 2, 5)
+            return by_axis.reshape([n * _BLOCK_CUBES for n in count])
 
         near_triangles, inside = map(joined, touched)
         cubes = near_triangles.nonzero()
@@ -231,9 +224,8 @@ class Voxelizer:
         begin, end = torch.tensor((tuple(low), tuple(high)), device=device)
         overlaps = ((cube_low + _CUBE_VOXELS > begin) & (cube_low < end)).all(1)
         out = self._blank(inside)
-        for batch in torch.stack((cubes, cube_low), 1)[overlaps].split(
-            max(1, _BATCH_VOXELS // _CUBE_VOXELS**3)
-        ):
+        batch_size = max(1, _BATCH_VOXELS // _CUBE_VOXELS**3)
+        for batch in torch.stack((cubes, cube_low), 1)[overlaps].split(batch_size):
             size = torch.full((len(batch),), self.spacing, dtype=torch.float64, device=device)
             for name, values in self.cubes(self._corner(batch[:, 1]), size, _CUBE_VOXELS).items():
                 out[name][batch[:, 0].unbind(1)] = values
@@ -247,12 +239,12 @@ class Voxelizer:
     def _blank(self, inside: Tensor) -> dict[str, Tensor]:
         """Returns by channel (gz, gy, gx, z, y, x, c) cubes as if far from all triangles."""
         both = self.constants(torch.tensor([False, True], device=self.device))
-        return {
-            name: torch.where(inside[..., None], values[1], values[0])[
-                ..., None, None, None, :
-            ].repeat(1, 1, 1, _CUBE_VOXELS, _CUBE_VOXELS, _CUBE_VOXELS, 1)
-            for name, values in both.items()
-        }
+        cubes = {}
+        for name, values in both.items():
+            cube_values = torch.where(inside[..., None], values[1], values[0])
+            repeats = (1, 1, 1, *(_CUBE_VOXELS,) * 3, 1)
+            cubes[name] = cube_values[..., None, None, None, :].repeat(repeats)
+        return cubes
 
     def _corner(self, zyx: Tensor) -> Tensor:
         """Returns (k, 3) float64 world positions x, y, z of the low corners of voxels z, y, x."""

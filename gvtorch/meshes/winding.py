@@ -77,9 +77,8 @@ class WindingNumber:
             toward = self._middle[box_index] - point_p3[point]
             distance = toward.norm(dim=1)
             far = distance > _FAR_RADII * self._radius[box_index]
-            total.index_add_(
-                0, point[far], self._dipole(box_index[far], toward[far], distance[far])
-            )
+            dipole = self._dipole(box_index[far], toward[far], distance[far])
+            total.index_add_(0, point[far], dipole)
             child = torch.arange(ARITY, device=total.device)
             box = (box[~far, None] * ARITY + child).view(-1)
             point = point[~far].repeat_interleave(ARITY)

@@ -122,12 +122,8 @@ class PointGrid:
         size = self.spacing_3 * self.branching**level
         index = np.arange(count + 1)
         return [
-            np.clip(
-                self.low[axis] + (voxel_k3[:, axis, None] + index) * size[axis],
-                self.low[axis],
-                self.high[axis],
-            )
-            for axis in range(3)
+            np.clip(low + (voxel[:, None] + index) * step, low, high)
+            for voxel, step, low, high in zip(voxel_k3.T, size, self.low, self.high, strict=True)
         ]
 
     def level_of_radius(self, radius: np.ndarray) -> np.ndarray:

@@ -39,9 +39,8 @@ class Points:
         value = ones if self.values is None else _checked_array("values", self.values)
         value = value[:, None] if value.ndim == 1 else value
         if value.ndim != 2 or len(value) != count or not value.shape[1]:
-            raise ValueError(
-                f"Points: values must be ({count},) or ({count}, c), got {value.shape}"
-            )
+            got = value.shape
+            raise ValueError(f"Points: values must be ({count},) or ({count}, c), got {got}")
         vars(self).update(positions=positions, values=value)
         for name, shape in (("colors", (count, 3)), ("radius", (count,))):
             if (attribute := getattr(self, name)) is None:

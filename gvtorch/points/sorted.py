@@ -84,11 +84,9 @@ class SortedPoints:
         try:
             if meta["version"] != _VERSION:
                 raise ValueError(f"version {meta['version']!r}, this reads {_VERSION}")
-            grid_fields = meta["grid"]
-            box = (grid_fields["low"], grid_fields["high"])
-            grid = PointGrid.around(
-                "grid", (), grid_fields["extent"], box, grid_fields["branching"]
-            )
+            fields = meta["grid"]
+            box = (fields["low"], fields["high"])
+            grid = PointGrid.around("grid", (), fields["extent"], box, fields["branching"])
             width = check.integer("a value", "width", meta["width"], low=1)
             tables = {
                 table_kind: {
@@ -111,10 +109,8 @@ class SortedPoints:
 
     def __repr__(self) -> str:
         x, y, z = self.grid.extent
-        location = "in memory" if self.folder is None else str(self.folder)
-        return (
-            f"SortedPoints({len(self)}, values of {self.width}, {x}x{y}x{z} (x, y, z), {location})"
-        )
+        place = "in memory" if self.folder is None else str(self.folder)
+        return f"SortedPoints({len(self)}, values of {self.width}, {x}x{y}x{z} (x, y, z), {place})"
 
     def save(self) -> None:
         """Writes the metadata that `open` reads, the last step of writing the folder."""
@@ -167,14 +163,11 @@ def sort_points(
     if target is not None and target.exists():
         raise FileExistsError(f"{target}: is there already; remove it or choose a new name")
     first = next(iter(points.blocks(1)))
-    row_bytes = 8 + sum(
-        column.itemsize * (column.size // len(column)) for column in _columns(first).values()
-    )
+    row_bytes = 8 + sum(column[:1].nbytes for column in _columns(first).values())
     block_rows = len(points)
     if target is not None:
-        block_rows = max(
-            4096, check.nbytes(context, "memory", memory) // (_BLOCK_COPIES * row_bytes)
-        )
+        nbytes = check.nbytes(context, "memory", memory)
+        block_rows = max(4096, nbytes // (_BLOCK_COPIES * row_bytes))
     grid = PointGrid.around(context, points.blocks(block_rows), extent, box, branching)
     draft = None if target is None else target.with_name(f".{target.name}.draft")
     if draft is not None:
@@ -215,7 +208,6 @@ def _checked_kinds(
 
 
 def _columns(points: Points) -> Rows:
-    """Returns the columns of points."""
     rows = {"position": points.positions, "value": points.values}
     return rows if points.radius is None else {**rows, "radius": points.radius}
 
@@ -248,9 +240,8 @@ class _Sorter:
             levels = self.grid.level_of_radius(rows["radius"])
             for level in np.unique(levels).tolist():
                 at_level = levels == level
-                self._level_runs(runs, level).append(
-                    {name: column[at_level] for name, column in rows.items()}
-                )
+                level_rows = {name: column[at_level] for name, column in rows.items()}
+                self._level_runs(runs, level).append(level_rows)
         runs = {level: level_runs for level, level_runs in sorted(runs.items()) if len(level_runs)}
         if not runs:
             raise ValueError(f"{context}: no point lies in the box")
@@ -353,11 +344,8 @@ class _Sorter:
         # A finest voxel holds the share itself (level 0), or at most that at the point's centre.
         largest_fraction = fraction if level == 0 else peak(radius, self.grid.spacing_3)[row]
         bounds = bounds_with_zero(largest_fraction[:, None] * value)
-        return {
-            "code": self.codes.of(target_voxel[nonzero]),
-            "value": fraction[:, None] * value,
-            **bounds,
-        }
+        code = self.codes.of(target_voxel[nonzero])
+        return {"code": code, "value": fraction[:, None] * value, **bounds}
 
 
 def finest_sums(blocks: Iterator[Rows]) -> Iterator[Rows]:

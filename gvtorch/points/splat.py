@@ -40,10 +40,9 @@ class _Cells(NamedTuple):
 
     def distinct(self) -> tuple[_Cells, np.ndarray]:
         """Returns the distinct cells, and (s,) the index of each cell among these."""
-        _, first_index, inverse = np.unique(self.code, return_index=True, return_inverse=True)
-        return self._replace(
-            **{n: getattr(self, n)[first_index] for n in self._fields[:5]}
-        ), inverse
+        _, first, inverse = np.unique(self.code, return_index=True, return_inverse=True)
+        fields = {name: getattr(self, name)[first] for name in self._fields[:5]}
+        return self._replace(**fields), inverse
 
     def rows_before(self) -> np.ndarray:
         """Returns (s,) the number of rows in all cells before each cell."""
@@ -195,9 +194,8 @@ def _cells(
     start = np.searchsorted(codes, code)
     count = np.searchsorted(codes, code + codes_covered) - start
     nonempty = np.flatnonzero(count)
-    cube, cell_index, code, start, count = (
-        array[nonempty] for array in (cube, cell_index, code, start, count)
-    )
+    arrays = (cube, cell_index, code, start, count)
+    cube, cell_index, code, start, count = (array[nonempty] for array in arrays)
     return _Cells(cube, first[cube, cell_index], code, start, count, size, codes_per_voxel)
 
 
@@ -252,20 +250,19 @@ def _wide_lists(points: SortedPoints, cubes: Cubes) -> tuple[np.ndarray, ...]:
     levels first: lists of cubes, positions, radii, values.
     """
     cube, run = [np.empty(0, np.int64)], [np.empty((0, 2), np.int64)]
-    parts = [(np.empty((0, 3)), np.empty(0), np.empty((0, points.width)))]
+    no_points = np.empty((0, 3)), np.empty(0), np.empty((0, points.width))
+    parts: list[tuple[np.ndarray, ...]] = [no_points]
     rows_before = 0
     for rows, cells in _wide_points(points, cubes):
         distinct, inverse = cells.distinct()
         row, _ = distinct.all_rows()
-        position, radius, value = (
-            rows[name][row].astype(np.float64) for name in ("position", "radius", "value")
-        )
         cube.append(cells.cube)
         run.append(rows_before + _runs(distinct, inverse))
-        parts.append((position, radius, value))
+        columns = (rows[name][row] for name in ("position", "radius", "value"))
+        parts.append(tuple(column.astype(np.float64) for column in columns))
         rows_before += len(row)
-    columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return (*_lists(cubes, np.concatenate(cube), np.concatenate(run)), *columns)
+    joined = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return (*_lists(cubes, np.concatenate(cube), np.concatenate(run)), *joined)
 
 
 def _runs(distinct: _Cells, inverse: np.ndarray) -> np.ndarray:

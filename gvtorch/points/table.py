@@ -45,12 +45,10 @@ class Table:
         return table
 
     def file(self, column: str) -> Path:
-        """Returns the path of a column's file."""
         assert self.folder is not None
         return self.folder / f"{self.name}.{column}"
 
     def append(self, rows: Rows) -> None:
-        """Adds rows."""
         self._rows = None
         self._count += len(rows["code"])
         if self.folder is None:
@@ -92,7 +90,6 @@ class Table:
             yield {name: values[start : start + count] for name, values in self.rows.items()}
 
     def remove(self) -> None:
-        """Removes the files."""
         self._rows = None
         for column in self.kinds:
             self.file(column).unlink(missing_ok=True)
@@ -133,9 +130,8 @@ class Runs(Table):
                 count = len(codes[run])
                 if limit is not None:
                     count = int(np.searchsorted(codes[run], limit, side="right"))
-                parts.append(
-                    {n: values[starts[run] : starts[run] + count] for n, values in rows.items()}
-                )
+                taken = slice(starts[run], starts[run] + count)
+                parts.append({name: values[taken] for name, values in rows.items()})
                 starts[run] += count
             block = {name: np.concatenate([part[name] for part in parts]) for name in rows}
             order = np.argsort(block["code"], kind="stable")

@@ -18,7 +18,6 @@ from ..base.image_info import ImageInfo
 from ..base.labels import background
 from ..base.lasting import lasting
 from ..base.stage import Progress, check_progress, no_progress
-from ..base.turns import Turns
 from ..base.volume import Volume, movable
 from ..ops import locate
 from .pools import (
@@ -31,6 +30,7 @@ from .pools import (
 )
 from .pyramid import TreePlan, choose_build_device, levels_by_depth, tree_depth
 from .refresh import BrickLevels, Span
+from .turns import Turns
 
 _frame_lock = threading.Lock()
 
@@ -201,11 +201,8 @@ class N3Tree:
         """
         self._check_words()
         child, brick = self.nodes.child_tn, self.nodes.brick_tn
-        pointer_kinds = (
-            ("tile", child, self.nodes.shared_t),
-            ("brick", brick, self.bricks.shared_b),
-        )
-        for name, pointers, shared in pointer_kinds:
+        tiles, bricks = (child, self.nodes.shared_t), (brick, self.bricks.shared_b)
+        for name, (pointers, shared) in (("tile", tiles), ("brick", bricks)):
             used = pointers[pointers >= 0].to(torch.int64)
             used = used[~shared[used]]
             if used.unique().numel() != used.numel():
@@ -288,9 +285,7 @@ class N3Tree:
             value_range={name: volume.value_range for name, volume in volumes.items()},
             labels=labels_by_channel(volumes),
         )
-        tree.filters = {
-            name: volume.filter for name, volume in volumes.items() if volume.filter != "mean"
-        }
+        tree.filters = {n: v.filter for n, v in volumes.items() if v.filter != "mean"}
         tree.infos = {name: volume.info for name, volume in volumes.items()}
         tree.threshold = threshold
         plan.write_nodes(tree.nodes, tree.bricks)
@@ -366,10 +361,8 @@ class N3Tree:
                 return  # outside the tree
         fine = [name for name, channel in self.bricks.channels.items() if not channel.coarse]
         filters = {name: self.filters.get(name, "mean") for name in fine}
-        tables = {
-            name: None if labels is None else labels.numpy() for name, labels in self.labels.items()
-        }
-        empty = {name: background(table) for name, table in tables.items()}
+        tables = self.labels.items()
+        empty = {n: background(None if table is None else table.numpy()) for n, table in tables}
         settings = filters, empty, self.spacing, self.threshold
         with self.turns.changing("N3Tree.refresh"):
             self.levels().refresh(Span(low[::-1], high[::-1]), *settings)

@@ -32,7 +32,6 @@ class Channel:
     coarse: bool = False  # whether only coarse bricks have it
 
     def __post_init__(self) -> None:
-        """Checks the fields."""
         if self.dtype not in CHANNEL_DTYPES:
             names = ", ".join(str(dtype).removeprefix("torch.") for dtype in CHANNEL_DTYPES)
             raise ValueError(f"Channel: dtype must be one of {names}, got {self.dtype}")
@@ -217,9 +216,7 @@ class NodePool(_Pool):
         branching = check.integer("NodePool", "branching", branching, low=2, high=MAX_BRANCHING)
         n = branching**3
         if capacity * n >= 2**31:
-            raise ValueError(
-                f"NodePool: {capacity} tiles of {n} nodes are more than int32 can name"
-            )
+            raise ValueError(f"NodePool: {capacity} tiles of {n} nodes: more than int32 can name")
         self.branching, self.channels = branching, dict(channels or {})
 
         def words(value: int, *shape: int) -> Tensor:
@@ -380,9 +377,7 @@ class BrickPool(_Pool):
 
     def _note_states(self) -> None:
         """Takes note of the tensors as they are: from now on `edited` looks for later writes."""
-        self._checked_states = {
-            name: _write_state(self.bricks[name]) for name in self._checked_states
-        }
+        self._checked_states = {n: _write_state(self.bricks[n]) for n in self._checked_states}
 
     def __repr__(self) -> str:
         return self._describe(f"bricks of {self.brick_size}^3+{self.border}")

@@ -99,24 +99,19 @@ def volume_levels(
     mean, rounded to the dtype (ties to even), its most frequent label, or what is seen of it along
     six directions.
     """
-    dtype = volume.data.dtype
+    dtype, device, how = volume.data.dtype, volume.data.device, volume.filter
     label_table = volume.label_values
     empty = background(None if label_table is None else label_table.numpy())
     values = low = high = as_grid(volume.data)
     for level in range(count):
         if level > 0:
-            values = coarser(
-                values, volume.filter, branching, dtype, volume.spacing, level, empty=empty
-            )
+            values = coarser(values, how, branching, dtype, volume.spacing, level, empty=empty)
             low, high = pool_min(low, branching), pool_max(high, branching)
         summary = NodeSummary(
-            low=torch.as_tensor(by_node(low, "min", brick_size, border), device=volume.data.device),
-            high=torch.as_tensor(
-                by_node(high, "max", brick_size, border), device=volume.data.device
-            ),
+            low=torch.as_tensor(by_node(low, "min", brick_size, border), device=device),
+            high=torch.as_tensor(by_node(high, "max", brick_size, border), device=device),
             mean=torch.as_tensor(
-                by_node(values, node_reduction(volume.filter), brick_size, 0),
-                device=volume.data.device,
+                by_node(values, node_reduction(how), brick_size, 0), device=device
             ),
         )
         stored = volume.data if level == 0 else from_grid(values, dtype)

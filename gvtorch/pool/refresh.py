@@ -222,6 +222,7 @@ class _ChannelLevels:
 
     def __post_init__(self) -> None:
         tree, size, border = self.tree, self.tree.bricks.brick_size, self.tree.bricks.border
+        self._size, self._border = size, border
         steps = [tree.branching**level for level in range(len(self.nodes_by_level))]
         # From this level on, a border spans whole finest bricks: their ranges are enough.
         whole_levels = (level for level, step in enumerate(steps) if border * step % size == 0)
@@ -244,12 +245,11 @@ class _ChannelLevels:
         """Writes the bricks of a level's `nodes`, of which `changed` voxels have changed; returns
         the summaries (k, c) of these nodes (k,).
         """
-        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
         self._make_level(level, changed, nodes)
         padded = self._with_borders(self._values, self._first, nodes)
         self._write_bricks(padded, node, exact)
-        inner = padded[tuple(slice(border, side - border) for side in padded.shape[:3])]
-        mean = reduce_windows(inner, node_reduction(self.how), size=size, step=size)
+        inner = padded[tuple(slice(self._border, side - self._border) for side in padded.shape[:3])]
+        mean = reduce_windows(inner, node_reduction(self.how), size=self._size, step=self._size)
         parts = (*self._ranges(level, nodes, padded), mean)
         flat = [torch.from_numpy(part.astype(np.float32)).flatten(0, 2) for part in parts]
         return NodeSummary(*flat)
@@ -259,8 +259,8 @@ class _ChannelLevels:
         of: the changed ones from the level before, others are read.
         """
         tree, n = self.tree, self.tree.branching
-        size, border, shape = tree.bricks.brick_size, tree.bricks.border, tree.shape(level)
-        needed = nodes.scaled(size).grown(border).joined(changed.divided(n).scaled(n))
+        shape = tree.shape(level)
+        needed = nodes.scaled(self._size).grown(self._border).joined(changed.divided(n).scaled(n))
         needed = needed.within(shape)
         if level == 0 or needed != changed:
             values = to_numpy(tree.read(self.name, level, needed))
@@ -279,8 +279,7 @@ class _ChannelLevels:
         """Returns the voxels of nodes with their borders, from `values`, which begin at voxel
         `first`; the outermost voxels are repeated.
         """
-        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
-        for axis, part in enumerate(nodes.scaled(size).grown(border).slices(first)):
+        for axis, part in enumerate(nodes.scaled(self._size).grown(self._border).slices(first)):
             inside = max(0, part.start)
             values = values[(slice(None),) * axis + (slice(inside, part.stop),)]
             after = part.stop - inside - values.shape[axis]
@@ -291,25 +290,18 @@ class _ChannelLevels:
         """Returns the smallest and the largest finest value in reach of a level's nodes, whose
         voxels with their borders are `padded`.
         """
-        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
         n = self.tree.branching**level
         if level >= self._by_brick:
             low, high = self._brick_ranges
-            reach, in_level = border * n // size, nodes.slices()
+            reach, in_level = self._border * n // self._size, nodes.slices()
             return by_node(low, "min", n, reach)[in_level], by_node(high, "max", n, reach)[in_level]
         low = high = padded
         if level > 0:
             assert self._finest is not None
-            first = self._finest.divided(n).first
-            low, high = (
-                self._with_borders(extremes, first, nodes)
-                for extremes in self._finest_extremes(level)
-            )
-        side = size + 2 * border
-        return (
-            reduce_windows(low, "min", size=side, step=size),
-            reduce_windows(high, "max", size=side, step=size),
-        )
+            first, extremes = self._finest.divided(n).first, self._finest_extremes(level)
+            low, high = (self._with_borders(values, first, nodes) for values in extremes)
+        windows = {"size": self._size + 2 * self._border, "step": self._size}
+        return reduce_windows(low, "min", **windows), reduce_windows(high, "max", **windows)
 
     def _finest_extremes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns the smallest and largest finest value of a level's voxels, near what changes."""
@@ -324,14 +316,14 @@ class _ChannelLevels:
     @cached_property
     def _brick_ranges(self) -> tuple[np.ndarray, np.ndarray]:
         """The smallest and largest voxel of each finest brick without its border, (z, y, x, c)."""
-        tree, size, border = self.tree, self.tree.bricks.brick_size, self.tree.bricks.border
+        tree = self.tree
         stored = tree.bricks.bricks[self.name].detach()
-        finest = Span((0, 0, 0), tree.extent).divided(size)
+        finest = Span((0, 0, 0), tree.extent).divided(self._size)
         node, exact = tree.find(_grid_positions(finest, stored.device), 0)
         slot = torch.where(exact, tree.slot_n[node], -1)
         constant = movable(tree.nodes.constants[self.name]).flatten(0, 1)[node]
         low = constant.view(stored.dtype).to(torch.float32)
-        high, inner = low.clone(), slice(border, border + size)
+        high, inner = low.clone(), slice(self._border, self._border + self._size)
         for part in (slot >= 0).nonzero()[:, 0].split(_BATCH_BRICKS):
             bricks = movable(stored)[slot[part]].view(stored.dtype)
             voxels = bricks[:, inner, inner, inner].to(torch.float32).flatten(1, 3)
@@ -341,10 +333,9 @@ class _ChannelLevels:
 
     def _write_bricks(self, padded: np.ndarray, node: Tensor, exact: Tensor) -> None:
         """Writes the bricks (with borders) of nodes (k,), whose voxels lie in `padded` in order."""
-        size, border = self.tree.bricks.brick_size, self.tree.bricks.border
         stored = self.tree.bricks.bricks[self.name].detach()
         slot = torch.where(exact, self.tree.slot_n[node], -1)
-        side = size + 2 * border
+        size, side = self._size, self._size + 2 * self._border
         level = movable(from_grid(padded, stored.dtype))
         windows = level.unfold(0, side, size).unfold(1, side, size).unfold(2, side, size)
         grid = windows.shape[:3]

@@ -93,7 +93,6 @@ class TableRows:
 
     @property
     def dtype(self) -> torch.dtype:
-        """The table's dtype."""
         return self.table.dtype
 
     def gather(self, out: Tensor | None = None) -> Tensor:

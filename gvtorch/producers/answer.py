@@ -69,10 +69,8 @@ def regions_of(
     kind = torch.where(constant, Region.CONSTANT, Region.DATA)
     return Regions(
         kind=torch.where(empty, Region.EMPTY, kind),
-        constants={
-            name: summary.constants(channels[name].dtype) for name, summary in summaries.items()
-        },
-        ranges={name: summary.ranges(channels[name].dtype) for name, summary in summaries.items()},
+        constants={n: s.constants(channels[n].dtype) for n, s in summaries.items()},
+        ranges={n: s.ranges(channels[n].dtype) for n, s in summaries.items()},
     )
 
 
@@ -117,10 +115,8 @@ def _checked(
     if missing := sorted(required - {*by_field.get("data", required)}):
         raise ValueError(f"{context}: channel {missing[0]!r} is missing")
     for name, values in by_field.items():
-        unexpected = {*values} & {*producer.channels} - (
-            required if name == "data" else fine_channels
-        )
-        if unexpected:
+        allowed = required if name == "data" else fine_channels
+        if unexpected := {*values} & {*producer.channels} - allowed:
             rule = "only bricks above the finest level hold"
             raise ValueError(f"{context}: {name} has channel {min(unexpected)!r}, which {rule}")
     fields: dict[str, Any] = {
@@ -150,15 +146,11 @@ def _refuse_late(
 ) -> None:
     """Raises ValueError if an answer that must stay on the device needs the host."""
     if answer.alias is not None or answer.errors:
-        raise ValueError(
-            f"{context}: a producer that is on_device answers without alias and errors"
-        )
+        raise ValueError(f"{context}: an on_device producer answers without alias and errors")
     for by_channel in fields:
         for name, values in by_channel.items():
             if isinstance(values, TableRows) or values.device != device:
-                raise ValueError(
-                    f"{context}: channel {name!r} of a producer that is on_device is not"
-                )
+                raise ValueError(f"{context}: channel {name!r} is not on the device: {device}")
 
 
 def _refuse_reversed(ranges: Mapping[str, Tensor], errors: dict[int, str]) -> None:
@@ -178,25 +170,17 @@ def _by_channel(
     """Returns the values of each channel as (*shape, width); a width of 1 may be left out."""
     result = {}
     for channel, value in values.items():
-        if channel not in producer.channels:
-            channel_names = ", ".join(producer.channels)
-            raise ValueError(
-                f"{context}: {name} has channel {channel!r}; the producer has {channel_names}"
-            )
+        check.channel(f"{context}: {name}", channel, producer.channels, "the producer")
         spec: Channel = producer.channels[channel]
-        expected_shape = (*shape, spec.width)
+        expected = (*shape, spec.width), spec.dtype
         lacks_width = isinstance(value, Tensor) and spec.width == 1 and value.shape == shape
         tensor = value[..., None] if lacks_width else value
         types = (Tensor, TableRows) if name == "data" else (Tensor,)
-        fits = (
-            isinstance(tensor, types)
-            and tensor.shape == expected_shape
-            and tensor.dtype == spec.dtype
-        )
+        fits = isinstance(tensor, types) and (tensor.shape, tensor.dtype) == expected
         if isinstance(tensor, Tensor):
             fits = fits and tensor.layout == torch.strided and not tensor.is_meta
         if not fits:
-            sizes = ", ".join(str(size) for size in expected_shape)
+            sizes = ", ".join(str(size) for size in expected[0])
             dtype = str(spec.dtype).removeprefix("torch.")
             raise ValueError(
                 f"{context}: {name}[{channel!r}] must be ({sizes}) {dtype}, "

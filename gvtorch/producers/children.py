@@ -12,7 +12,7 @@ from torch import Tensor
 from ..base import check
 from ..base.downsample import from_grid
 from ..base.rows import distinct_rows
-from ..base.volume import to_numpy
+from ..base.volume import movable, to_numpy
 from ..pool import Channel
 from ..pool.pyramid import coarser
 from ..pool.staging import on_device
@@ -63,9 +63,8 @@ class FromChildren(OfProducers):
             raise ValueError(f"{context}: {type(producer).__name__} {reason}")
         if any(channel.coarse for channel in producer.channels.values()):
             raise ValueError(f"{context}: {type(producer).__name__} makes coarse channels itself")
-        super().__init__(
-            **grid_of(producer), channels=producer.channels, value_range=producer.value_range
-        )
+        ranges = producer.value_range
+        super().__init__(**grid_of(producer), channels=producer.channels, value_range=ranges)
         self.producer = producer
         self.levels = check.integer(context, "levels", levels, low=1, high=10)
         self._cache: dict[tuple[int, ...], Blocks] = {}  # blocks above the finest level, by loc
@@ -124,19 +123,16 @@ class FromChildren(OfProducers):
         kind = torch.full((len(nodes),), int(Region.DATA), device="cpu")
         if finest_bricks.kind is not None:
             kind[fine.cpu()] = finest_bricks.kind.cpu()
-        data, constants, coarse_data = {}, {}, self._coarse_bricks(nodes[coarse])
-        order = torch.cat((fine, coarse)).argsort().cpu()
-        for name, rows in coarse_data.items():
-            pieces = [to_numpy(on_device(finest_bricks.data[name], rows.device)), to_numpy(rows)]
-            data[name] = from_grid(np.concatenate(pieces)[order.numpy()], rows.dtype)
+        data, constants = {}, {}
+        for name, rows in self._coarse_bricks(nodes[coarse]).items():
+            data[name] = rows.new_empty((len(nodes), *rows.shape[1:]))
+            movable(data[name])[coarse.cpu()] = movable(rows)
+            fine_rows = on_device(finest_bricks.data[name], rows.device)
+            movable(data[name])[fine.cpu()] = movable(fine_rows)
             if name in finest_bricks.constants:
-                fine_constants = to_numpy(finest_bricks.constants[name].cpu())
-                coarse_constants = np.zeros(
-                    (len(coarse), *fine_constants.shape[1:]), fine_constants.dtype
-                )
-                constants[name] = from_grid(
-                    np.concatenate((fine_constants, coarse_constants))[order.numpy()], rows.dtype
-                )
+                values = finest_bricks.constants[name].cpu()
+                constants[name] = values.new_zeros((len(nodes), *values.shape[1:]))
+                movable(constants[name])[fine.cpu()] = movable(values)
         errors = {int(fine[index]): message for index, message in finest_bricks.errors.items()}
         return Bricks(data=data, kind=kind, constants=constants, errors=errors)
 
@@ -234,7 +230,6 @@ class FromChildren(OfProducers):
 
 
 def _zeros(channels: Mapping[str, Channel], count: int, side: int) -> Blocks:
-    """Returns zeros of all channels."""
     return {
         name: to_numpy(
             torch.zeros((count, *(side,) * 3, channel.width), dtype=channel.dtype, device="cpu")

@@ -88,27 +88,20 @@ class FieldProducer(Producer):
             branching=branching,
             value_range=value_range,
         )
-        widths, field_widths = (
+        widths, expected = (
             {name: channel.width for name, channel in part.items()}
             for part in (self.channels, field_channels)
         )
-        if widths != field_widths:
-            raise ValueError(
-                f"{context}: channels must be {field_widths} numbers wide, got {widths}"
-            )
+        if widths != expected:
+            raise ValueError(f"{context}: channels must be {expected} numbers wide, got {widths}")
         if dtype not in (None, torch.float32, torch.float64):
-            raise ValueError(
-                f"{context}: dtype must be torch.float32 or torch.float64, got {dtype}"
-            )
+            raise ValueError(f"{context}: dtype must be float32 or float64, got {dtype}")
         self.field = field
         count = branching if samples is None else samples
         self.samples = check.integer(context, "samples", count, low=1, high=64)
-        axis_offsets = (
-            torch.arange(self.samples, dtype=torch.float64, device="cpu") + 0.5
-        ) / self.samples - 0.5
-        self.register_buffer(
-            "offsets", torch.cartesian_prod(axis_offsets, axis_offsets, axis_offsets)
-        )
+        index = torch.arange(self.samples, dtype=torch.float64, device="cpu")
+        offsets = (index + 0.5) / self.samples - 0.5
+        self.register_buffer("offsets", torch.cartesian_prod(offsets, offsets, offsets))
         self.threshold = self._thresholds(context, known_field, threshold)
         self.dtype = dtype or position_dtype(box, self.spacing)
 
@@ -121,11 +114,7 @@ class FieldProducer(Producer):
         if not isinstance(threshold, Mapping):
             threshold = dict.fromkeys(self.channels, threshold)
         for name in threshold:
-            if name not in self.channels:
-                channel_names = ", ".join(self.channels)
-                raise ValueError(
-                    f"{context}: threshold has channel {name!r}; there are {channel_names}"
-                )
+            check.channel(f"{context}: threshold", name, self.channels, "the field")
         return {n: check.number(context, "threshold", value) for n, value in threshold.items()}
 
     def classify(self, nodes: Nodes) -> Regions:
@@ -168,14 +157,10 @@ class FieldProducer(Producer):
         # Infinite values become NaN: they must fail, not be clamped to the largest number.
         nan_marked = {name: rows.masked_fill(rows.isinf(), math.nan) for name, rows in data.items()}
         stored = {name: self._to_channel_dtype(name, rows) for name, rows in nan_marked.items()}
-        integer_names = [
-            n for n, channel in self.channels.items() if not channel.dtype.is_floating_point
-        ]
-        if not integer_names:
+        integers = [n for n, c in self.channels.items() if not c.dtype.is_floating_point]
+        if not integers:
             return Bricks(data=stored)
-        finite = torch.stack(
-            [data[name].isfinite().flatten(1).all(1) for name in integer_names]
-        ).all(0)
+        finite = torch.stack([data[n].isfinite().flatten(1).all(1) for n in integers]).all(0)
         # Integers can't hold NaN: such bricks get kind -1, which fails.
         return Bricks(data=stored, kind=torch.where(finite, int(Region.DATA), -1))
 
@@ -224,10 +209,8 @@ class FieldProducer(Producer):
         """Returns intervals by channel, (k, c) each, for the channels that have known bounds."""
         if not isinstance(self.field, Field):
             return {}
-        compute_bounds = self.field.filtered_bounds
-        bounds = _call_field(
-            type(self).__name__, self.field, compute_bounds, center, half_extent, size
-        )
+        context, method = type(self).__name__, self.field.filtered_bounds
+        bounds = _call_field(context, self.field, method, center, half_extent, size)
         if bounds is None:
             return {}
         by_channel = bounds if isinstance(bounds, Mapping) else {"value": bounds}
@@ -238,7 +221,6 @@ class FieldProducer(Producer):
         }
 
     def _to_channel_dtype(self, name: str, values: Tensor) -> Tensor:
-        """Converts values to a channel's dtype."""
         channel = self.channels[name]
         low, high = channel.limits
         values = values.float() if values.dtype.itemsize < 4 else values  # float16 has less range
@@ -310,9 +292,8 @@ def group_alike(
         else:
             groups.append(group)
     for group in groups:
-        reduced = check.instance(
-            f"{name}.near", "answer", field.near(center[group], half_extent[group]), Field
-        )
+        reduced = field.near(center[group], half_extent[group])
+        check.instance(f"{name}.near", "answer", reduced, Field)
         yield from ((rows, reduced) for rows in group.split(count))
 
 
@@ -346,15 +327,13 @@ def _by_channel(context: str, values: Any, points: Tensor) -> dict[str, Tensor]:
     if isinstance(values, Tensor):
         values = {"value": values}
     if not isinstance(values, Mapping) or not values:
-        raise ValueError(
-            f"{context}: field must give a tensor, or a dict of them, got {type(values).__name__}"
-        )
+        got = type(values).__name__
+        raise ValueError(f"{context}: field must give a tensor, or a dict of them, got {got}")
     by_channel, leading_shape = {}, points.shape[:-1]
     for name, value in values.items():
         if not isinstance(value, Tensor) or not value.dtype.is_floating_point:
-            raise ValueError(
-                f"{context}: field must give floats for {name!r}, got {check.describe(value)}"
-            )
+            got = check.describe(value)
+            raise ValueError(f"{context}: field must give floats for {name!r}, got {got}")
         with_width = value[..., None] if value.shape == leading_shape else value
         if with_width.shape[:-1] != leading_shape:
             sizes = ", ".join(str(size) for size in leading_shape)

@@ -160,10 +160,8 @@ class Hypertexture(EvaluationCounter, Producer):
             if weight:
                 weighted.append(octave._replace(amplitude=octave.amplitude * weight))
         high = noise.bounds(noise.perlin).high
-        remaining = [
-            high * sum(octave.amplitude for octave in weighted[n:])
-            for n in range(len(weighted) + 1)
-        ]
+        amplitudes = [octave.amplitude for octave in weighted]
+        remaining = [high * sum(amplitudes[n:]) for n in range(len(amplitudes) + 1)]
         margin = _ROUNDING * max(1.0, *remaining)
         remaining = [bound + margin for bound in remaining]
         return LevelOctaves(weighted, remaining, math.sqrt(5 * variance), side)
@@ -176,9 +174,8 @@ class Hypertexture(EvaluationCounter, Producer):
         distance = distances_of(type(self).__name__, self.shape, points)
         total = distance * (-1 / self.thickness)
         for octave in self.octaves:
-            total = total + octave.amplitude * noise.perlin(
-                points * octave.frequency, seed=octave.seed
-            )
+            octave_noise = noise.perlin(points * octave.frequency, seed=octave.seed)
+            total = total + octave.amplitude * octave_noise
         return self._channels(total, distance, self.softness)
 
     def classify(self, nodes: Nodes) -> Regions:
@@ -236,9 +233,8 @@ class Hypertexture(EvaluationCounter, Producer):
             if not len(active):
                 break
             self._count(evaluations=values.numel())
-            values = values + octave.amplitude * noise.perlin(
-                points * octave.frequency, seed=octave.seed
-            )
+            octave_noise = noise.perlin(points * octave.frequency, seed=octave.seed)
+            values = values + octave.amplitude * octave_noise
         total[active] = values
         return self._channels(total, distance, level.half_width)
 

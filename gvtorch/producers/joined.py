@@ -103,9 +103,8 @@ class JoinedProducer(OfProducers):
         for name, answer in regions.items():
             ((channel_name, channel),) = self.parts()[name].channels.items()
             zero = torch.zeros((len(kind), channel.width), dtype=channel.dtype, device=kind.device)
-            constants[name] = (
-                answer.constants.get(channel_name, zero).view(len(kind), -1).to(channel.dtype)
-            )
+            constant = answer.constants.get(channel_name, zero)
+            constants[name] = constant.view(len(kind), -1).to(channel.dtype)
             if channel_name in answer.ranges:
                 ranges[name] = answer.ranges[channel_name]
         return Regions(kind=kind, constants=constants, ranges=ranges, errors=_errors(regions))
@@ -133,9 +132,8 @@ class JoinedProducer(OfProducers):
         """
         device = nodes.loc.device if self.on_device else torch.device("cpu")
         data = torch.full((len(nodes),), int(Region.DATA), device=device)
-        stacked = torch.stack(
-            [data if kind is None else kind.to(device, torch.int64) for kind in kinds]
-        )
+        on_device = [data if kind is None else kind.to(device, torch.int64) for kind in kinds]
+        stacked = torch.stack(on_device)
         if device.type == "cpu" and bool((stacked == Region.ALIAS).any()):
             raise ValueError("JoinedProducer: producers must answer without alias")
         voxels = (stacked == Region.DATA) | (stacked == Region.DATA_MAX_DEPTH)
@@ -176,15 +174,11 @@ class StoredChannels(JoinedProducer):
             raise ValueError(f"{store}: is not a store of several channels: use StoredProducer")
         names = stored_names if channels is None else tuple(channels)
         for name in names:
-            if name not in stored_names:
-                raise ValueError(
-                    f"{store}: has no channel {name!r}; there are {', '.join(stored_names)}"
-                )
+            check.channel(str(store), name, stored_names, "the store")
         limit = check.nbytes("StoredChannels", "host_cache", host_cache) // max(len(names), 1)
         options: dict[str, Any] = {"host_cache": limit, "timeout": timeout, "workers": workers}
-        super().__init__(
-            {name: StoredProducer(Store.open(store, image=name), **options) for name in names}
-        )
+        stores = {name: Store.open(store, image=name) for name in names}
+        super().__init__({n: StoredProducer(opened, **options) for n, opened in stores.items()})
 
 
 def _when_all(answers: Mapping[str, Any], join: Callable[[Mapping[str, Any]], Any]) -> Any:

@@ -102,14 +102,11 @@ class MeshProducer(Producer):
         # Finest voxels are sampled at one position, which is faster; reading `coarse` is free here.
         order = coarse.to(torch.int8).argsort(stable=True)
         fine_rows, coarse_rows = order.split([len(order) - int(coarse.sum()), int(coarse.sum())])
-        parts = [grid.cubes(low[fine_rows], voxel[fine_rows], side)]
-        parts.append(
-            grid.cubes(low[coarse_rows], voxel[coarse_rows], side, coarse_k=coarse[coarse_rows])
-        )
-        original_order = order.argsort()
-        return Bricks(
-            data={n: torch.cat([p[n] for p in parts])[original_order] for n in self.channels}
-        )
+        fine = grid.cubes(low[fine_rows], voxel[fine_rows], side)
+        low, voxel, coarse = low[coarse_rows], voxel[coarse_rows], coarse[coarse_rows]
+        means = grid.cubes(low, voxel, side, coarse_k=coarse)
+        row = order.argsort()
+        return Bricks(data={n: torch.cat((fine[n], means[n]))[row] for n in self.channels})
 
 
 def _cubes(nodes: Nodes, grid: Voxelizer) -> tuple[Tensor, Tensor]:

@@ -108,7 +108,6 @@ class Nodes:
         coarse: bool = False,
         parents: Mapping[str, Tensor] | None = None,
     ) -> None:
-        """See the class."""
         self.loc, self.layout, self.coarse, self.parents = loc, layout, coarse, parents
         self._cache: dict[str, Tensor] = {}  # a cache of properties that torch.compile can trace
 
@@ -116,7 +115,6 @@ class Nodes:
         return self.loc.shape[0]
 
     def __getitem__(self, index: slice | Tensor) -> Nodes:
-        """Returns some of the nodes."""
         parents = self.parents
         if parents is not None:
             parents = {name: rows[index] for name, rows in parents.items()}

@@ -112,10 +112,9 @@ class OctaveProducer(Producer):
             deep = max(self.extent) > DEEP_VOXELS
             coordinates = coordinates.to(torch.float64 if deep else torch.float32)
             parents = None if parents is None else parents.to(coordinates.dtype)
-        brick_options = {"border": layout.border, "branching": layout.branching}
-        values, inherited = self.total.bricks(
-            coordinates.unbind(1), side, parents, nodes.child, **brick_options
-        )
+        axes = coordinates.unbind(1)
+        options = {"border": layout.border, "branching": layout.branching}
+        values, inherited = self.total.bricks(axes, side, parents, nodes.child, **options)
         if self.values is None:
             return values, inherited
         result = self.values(values, nodes)

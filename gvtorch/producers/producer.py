@@ -260,11 +260,8 @@ class Producer(torch.nn.Module):
             check.instance(context, f"channels[{name!r}]", channel, Channel)
         self.value_range, self.labels = dict(value_range or {}), dict(labels or {})
         for argument, by_channel in (("value_range", self.value_range), ("labels", self.labels)):
-            if unknown := sorted(map(str, {*by_channel} - {*self.channels})):
-                channel_names = ", ".join(self.channels)
-                raise ValueError(
-                    f"{context}: {argument} has channel {unknown[0]!r}; there are {channel_names}"
-                )
+            for name in by_channel:
+                check.channel(f"{context}: {argument}", name, self.channels, "the producer")
         for name, bounds in self.value_range.items():
             low, high = check.reals(context, f"value_range[{name!r}]", bounds, (2,))
             if low > high:
@@ -359,10 +356,10 @@ class Producer(torch.nn.Module):
         old_times = {float(clock) for clock in clocks}
         for clock in clocks:
             clock.fill_(time)
-        same_time = len(old_times) == 1
-        self.changed(
-            partial(self.differs, before=old_times.pop(), after=time) if same_time else None
-        )
+        where = None
+        if len(old_times) == 1:
+            where = partial(self.differs, before=old_times.pop(), after=time)
+        self.changed(where)
 
     @contextmanager
     def at_time(self, time: float) -> Iterator[None]:
@@ -432,9 +429,7 @@ class Producer(torch.nn.Module):
         if kind is not None and bool(((kind < Region.EMPTY) | (kind == Region.ALIAS)).any()):
             raise ValueError(f"{type(self).__name__}.at: a brick is not finite, or an alias")
         shape = (len(loc), *(layout.side,) * 3, -1)
-        return {
-            name: on_device(answer.voxels(name), loc.device).view(shape) for name in answer.data
-        }
+        return {n: on_device(answer.voxels(n), loc.device).view(shape) for n in answer.data}
 
     def as_bricks(self, answer: Any) -> Any:
         """Wraps an answer of `fill` in `Bricks`; returns `Bricks` and invalid answers unchanged."""
@@ -485,9 +480,8 @@ class OfProducers(Producer):
 
     def changes(self, since: int) -> list[ChangeTest] | None:
         """See `Producer.changes`; returns the changes of all parts."""
-        part_changes = [
-            part.changes(since) for part in self.parts().values() if part.version > since
-        ]
+        newer = [part for part in self.parts().values() if part.version > since]
+        part_changes = [part.changes(since) for part in newer]
         known_changes = [changes for changes in part_changes if changes is not None]
         if len(known_changes) < len(part_changes):
             return None
@@ -501,12 +495,10 @@ class OfProducers(Producer):
         return torch.stack([part.differs(nodes, before, after) for part in timed]).any(0)
 
     def prepare(self, layout: Layout) -> None:
-        """Prepares all parts."""
         for part in self.parts().values():
             part.prepare(layout)
 
     def close(self) -> None:
-        """Closes all parts."""
         for part in self.parts().values():
             part.close()
 

@@ -276,9 +276,7 @@ class StoredProducer(Producer):
                 in_range = (cell < end).all(1)
                 targets = rows[in_range]
                 cells, cell_errors = self._cells(level, cell[in_range])
-                errors.update(
-                    {int(targets[index]): message for index, message in cell_errors.items()}
-                )
+                errors |= {int(targets[n]): message for n, message in cell_errors.items()}
                 low[targets] = np.minimum(low[targets], cells[:, 0])
                 high[targets] = np.maximum(high[targets], cells[:, 1])
                 if store.info.labels:
@@ -387,9 +385,8 @@ class StoredProducer(Producer):
                     continue
                 starts = tuple(n - layout.side + 1 for n in cube.shape[:3])
                 shape, strides = (*starts, *out.shape[1:]), (*cube.strides[:3], *cube.strides)
-                out[rows[brick_rows]] = as_strided(cube, shape, strides)[
-                    tuple(corner[brick_rows].T)
-                ]
+                windows = as_strided(cube, shape, strides)
+                out[rows[brick_rows]] = windows[tuple(corner[brick_rows].T)]
         return errors
 
     def _read_cubes(

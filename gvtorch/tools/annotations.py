@@ -52,7 +52,6 @@ class Annotations:
 
 
 def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
-    """Returns the colour bar of a shader's transfer function."""
     from ..pictures import ColorBar
     from ..viewer.state import transfer_of
 

@@ -224,9 +224,8 @@ def _print_table(content: dict[str, Any]) -> None:
         elif isinstance(value, dict):
             text = "\n".join(printable(f"{key}: {item}") for key, item in value.items())
         elif isinstance(value, (list, tuple)):
-            text = ", ".join(
-                f"{item:g}" if isinstance(item, float) else printable(item) for item in value
-            )
+            items = (f"{n:g}" if isinstance(n, float) else printable(n) for n in value)
+            text = ", ".join(items)
         else:
             text = f"{value:g}" if isinstance(value, float) else printable(value)
         table.add_row(Text(name, "bold"), Text(text))

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 def option(**options: Any) -> Any:
     """Returns tyro's `arg` for a flag whose help names its default only if there is one."""
-    return arg(help_behavior_hint=_default_hint, **options)
 
+    def default_hint(value: str) -> str:
+        return "" if value in ("None", "False", "''") else f"(default: {value})"
 
-def _default_hint(value: str) -> str:
-    return "" if value in ("None", "False", "''") else f"(default: {value})"
+    return arg(help_behavior_hint=default_hint, **options)
 
 
 #: A flag that is given or not: there is no --no-NAME.
@@ -68,7 +68,6 @@ class ReadOptions:
     labels: Switch = False
 
     def read(self, path: str | Path) -> Volume:
-        """Reads the volume at `path`."""
         from ..io.reading import read_volume
 
         return read_volume(path, **self.options())
@@ -100,9 +99,8 @@ class Bar:
         rate: tuple[ProgressColumn, ...] = (TransferSpeedColumn(),) if speed else ()
         columns = (TextColumn("{task.description}"), BarColumn(), *rate, TimeRemainingColumn())
         console = Console(stderr=True)
-        self._progress = Progress(
-            *columns, console=console, transient=True, disable=not console.is_terminal
-        )
+        disable = not console.is_terminal
+        self._progress = Progress(*columns, console=console, transient=True, disable=disable)
         self._tasks: dict[str, Any] = {}
         self._timer = threading.Timer(1.0, self._progress.start)
         self._timer.daemon = True

@@ -96,7 +96,6 @@ class Fly:
             film = Video(self.output, width, height, fps=fps) if is_film else None
             writer = _FrameWriter(self.output, film)
             if self.stats is not None:  # at the end: a full disk leaves the old file
-                writer.stats_lines = []
                 stack.callback(writer.write_stats, self.stats)
             steps = math.inf if self._stands_still() else max(1, frames - 1 + self._loops())
             for time, frame_numbers in self._time_parts(frames):
@@ -229,7 +228,6 @@ class Fly:
 
     @cached_property
     def _time_count(self) -> int:
-        """The number of time points of the data."""
         from ..io.reading import open_source
         from ..io.stores.store import Store
 
@@ -268,17 +266,13 @@ class Fly:
             frames = default_frames if self.frames is None else self.frames
             return check.integer("fly", "--frames", frames, low=1), fps
         if self.frames is not None:
-            raise ValueError(
-                "--turntable and --frames both set the number of pictures: leave one out"
-            )
+            raise ValueError("--turntable and --frames both set the number: leave one out")
         if self.flight != "orbit":
             raise ValueError("--turntable goes once around: not with --path FILE.json")
         from ..viewer.flight import MAX_PICTURES
 
-        longest = MAX_PICTURES / fps
-        seconds = check.number(
-            "fly", "--turntable", self.turntable, low=0, high=longest, open_low=True
-        )
+        limits: Any = {"low": 0, "high": MAX_PICTURES / fps, "open_low": True}
+        seconds = check.number("fly", "--turntable", self.turntable, **limits)
         return max(1, round(seconds * fps)), fps
 
     def _check_path(self) -> None:
@@ -352,7 +346,7 @@ class _FrameWriter:
 
     def __init__(self, output: Path, film: Video | None) -> None:
         self._output, self._film = output, film
-        self.stats_lines: list[str] | None = None  # of JSON, if statistics are wanted
+        self.stats_lines: list[str] = []  # of JSON
         self.incomplete = 0
         self.cameras: dict[str, Camera] = {}
 
@@ -360,8 +354,7 @@ class _FrameWriter:
         name, stats = f"{number:04d}.png", picture.stats.as_dict()
         self.cameras[name] = camera
         self.incomplete += not stats.get("converged", True)
-        if self.stats_lines is not None:
-            self.stats_lines.append(json.dumps({"picture": number, **stats}) + "\n")
+        self.stats_lines.append(json.dumps({"picture": number, **stats}) + "\n")
         if self._film is not None:
             self._film.add(picture)
         else:

@@ -132,10 +132,9 @@ def parse_lighting(text: str) -> Lighting:
         flag = f"--lighting {kind}"
         if kind in ("sun", "lamp"):
             *vector, size = parse_numbers(flag, rest, 4, float)
-            is_sun = kind == "sun"
-            lights.append(
-                DirectionalLight(vector, angle=size) if is_sun else PointLight(vector, radius=size)
-            )
+            sun = kind == "sun"
+            light = DirectionalLight(vector, angle=size) if sun else PointLight(vector, radius=size)
+            lights.append(light)
         elif kind == "sky":
             options["ambient"] = parse_numbers(flag, rest, 3, float)
         elif kind in _LIGHTING_FACTORS:
@@ -163,9 +162,8 @@ def parse_clip(text: str) -> Clip:
             shapes[kind].append(values if kind == "plane" else (values[:3], values[3:]))
         else:
             raise ValueError(f"--clip must hold plane:, box:, cut: or caps, got {item.strip()!r}")
-    return Clip(
-        planes=shapes["plane"], boxes=shapes["box"], without=shapes["cut"], frame="box", caps=caps
-    )
+    planes, boxes, cuts = shapes.values()
+    return Clip(planes=planes, boxes=boxes, without=cuts, frame="box", caps=caps)
 
 
 def parse_lens(text: str) -> ThinLens:
@@ -186,9 +184,6 @@ def parse_background(text: str) -> Any:
         return None
     if Path(text).suffix[1:].isalpha():
         return Environment.read(text)
-    top, slash, bottom = text.partition("/")
-    if slash:
-        return Gradient(
-            *(tuple(parse_numbers("--background", part, 3, float)) for part in (top, bottom))
-        )
-    return tuple(parse_numbers("--background", text, 3, float))
+    parts = text.split("/", 1)
+    colors = [tuple(parse_numbers("--background", part, 3, float)) for part in parts]
+    return Gradient(*colors) if len(colors) == 2 else colors[0]

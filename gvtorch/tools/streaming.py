@@ -79,7 +79,6 @@ class Streaming:
         return StoredColor("value", lit=True, **options)
 
     def shader(self, store: Store, look: Look) -> Shader:
-        """Returns the shader that shows a store."""
         from ..shaders import Filtered, Lit
 
         shader = self._mesh_shader(store, look) or look.make_shader(store)

@@ -124,11 +124,8 @@ class View:
     def _run_script(self) -> tuple[Any, Shader | None, Camera | None, dict[str, Any]]:
         import runpy
 
-        flags = [
-            flag
-            for group in ("look", "streaming", "source")
-            for flag in given_flags(getattr(self.scene, group))
-        ]
+        groups = self.scene.look, self.scene.streaming, self.scene.source
+        flags = [flag for group in groups for flag in given_flags(group)]
         flags += ["--camera"] * (self.camera is not None)
         flags += ["--threshold"] * (self.scene.threshold is not None)
         if flags:

@@ -33,10 +33,6 @@ class Interrupted(Exception):
     """Ends work early: something newer is to be shown, or nobody waits any more."""
 
 
-def _discard(_: str | bytes) -> None:
-    """Drops messages to a page that has left."""
-
-
 class Client:
     """A page.
 
@@ -45,7 +41,7 @@ class Client:
         eye: Its camera.
         size: (width, height) pixels of its picture.
         follows: The number of the client whose camera it follows, or None.
-        picture: Its last picture, or None.
+        picture: Its last picture, developed and without planes, or None.
         monitor: Whether it receives figures of the frames.
         nodes: Whether it receives boxes of the nodes of each frame.
         planes_changed: Whether planes beside its picture have changed, but not the picture.
@@ -53,7 +49,6 @@ class Client:
     """
 
     def __init__(self, number: int, send: Send, eye: Eye) -> None:
-        """Takes a function that sends a text or bytes to the page."""
         self.number, self._send = number, send
         self.eye, self.size, self.rate = eye, (0, 0), 25.0
         self.follows: int | None = None
@@ -63,8 +58,7 @@ class Client:
         self._progressive: Progressive | None = None
         self._settled, self._unchanged_frames, self._finished = False, 0, False
         self._last_sent_time = self._paused_until = 0.0
-        # Developed picture, milliseconds that it took, and whether it is final.
-        self._last_shown: tuple[Picture, float, bool] | None = None
+        self._last_shown = (0.0, False)  # milliseconds that `picture` took, whether it is final
         self._pixel_ms, self._fixed_ms = 5e-4, 0.0  # cost of a pixel; of a frame in addition
         self.picture: Picture | None = None
         self._camera: Camera | None = None
@@ -77,7 +71,7 @@ class Client:
 
     def end(self) -> None:
         """Drops the references to page and scene, so that neither keeps the other alive."""
-        self._send, self._progressive, self.gone = _discard, None, True
+        self._send, self._progressive, self.gone = lambda _: None, None, True
 
     # The network's side.
 
@@ -107,15 +101,9 @@ class Client:
             self._in_flight = number
         self._send(data)
 
-    @property
-    def busy(self) -> bool:
-        """Whether a picture waits for the network."""
-        return self._waiting_picture is not None
-
     # The renderer's side.
 
     def move(self, eye: Eye, moving: bool, sent: float) -> None:
-        """Sets the camera."""
         self.eye, self._moving, self._finished = eye, moving, False
         self._move_time, self._move_clock = time.monotonic(), sent
 
@@ -140,7 +128,8 @@ class Client:
 
     def wants_picture(self) -> bool:
         """Returns whether a picture is to be drawn now."""
-        if not self.is_unfinished() or self.busy or time.monotonic() < self._paused_until:
+        waits_for_network = self._waiting_picture is not None
+        if not self.is_unfinished() or waits_for_network or time.monotonic() < self._paused_until:
             return False
         return self.resting or self.planes_changed or self._draft_key != (self.eye, self.size)
 
@@ -161,9 +150,8 @@ class Client:
         """
         self._planes, self._scene_time = planes if state.slices is not None else None, scene.time
         is_draft = self._draft_key != (self.eye, self.size)
-        if not is_draft and self.planes_changed and self._last_shown is not None:
-            picture, elapsed_ms, final = self._last_shown
-            self._send_picture(picture, state, _FINAL_QUALITY, elapsed_ms, final)
+        if not is_draft and self.planes_changed and self.picture is not None:
+            self._send_picture(self.picture, state, _FINAL_QUALITY, *self._last_shown)
             return None
         try:
             draw = self._draw_draft if is_draft else self._draw_refined
@@ -202,7 +190,7 @@ class Client:
         self._draft_key, self._progressive = (self.eye, self.size), None
         self._settled, self._unchanged_frames = False, 0
         quality = _FINAL_QUALITY if size[0] * size[1] <= _CHEAP_PIXELS else _DRAFT_QUALITY
-        self.picture, self._camera = picture, camera
+        self._camera = camera
         self._send_picture(state.develop.develop(picture), state, quality, elapsed_ms, final=False)
         return picture
 
@@ -232,7 +220,7 @@ class Client:
             self._update_settled(scene, drawn)
             self._finished = self._settled
             elapsed_ms = 1e3 * (time.perf_counter() - start)
-            self.picture, self._camera = picture, camera
+            self._camera = camera
             self._send_picture(picture, state, _FINAL_QUALITY, elapsed_ms, self._finished)
             return picture
         if self._progressive is None:
@@ -253,7 +241,7 @@ class Client:
             or time.monotonic() - self._last_sent_time > _SHOW_SECONDS
             or not self._settled
         ):
-            self.picture, self._camera = picture, camera
+            self._camera = camera
             developed = state.develop.develop(picture)
             self._send_picture(developed, state, _FINAL_QUALITY, elapsed_ms, self._finished)
         return picture
@@ -269,7 +257,8 @@ class Client:
         self, shown: Picture, state: ViewState, quality: int, elapsed_ms: float, final: bool
     ) -> None:
         """Sends a developed picture, with planes beside it if there are any."""
-        self._last_shown, self.planes_changed = (shown, elapsed_ms, final), False
+        self.picture, self._last_shown = shown, (elapsed_ms, final)
+        self.planes_changed = False
         self._picture_number += 1
         self._last_sent_time = time.monotonic()
         missed, layout = shown.missed, None
@@ -301,8 +290,7 @@ class Client:
         if not distance < float("inf"):
             return None
         rays = self._camera.rays(rows=(row, row + 1))
-        position = rays.origin[column] + distance * rays.direction[column]
-        return position.tolist()
+        return (rays.origin[column] + distance * rays.direction[column]).tolist()
 
 
 def image_file(picture: Picture, kind: str, **options: Any) -> bytes:

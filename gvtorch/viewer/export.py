@@ -35,7 +35,6 @@ class SurfaceExport:
 
     @property
     def busy(self) -> bool:
-        """Whether it is still being made."""
         return self._thread.is_alive()
 
     def _run(self) -> None:

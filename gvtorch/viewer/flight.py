@@ -1,6 +1,6 @@
 """`Flight`: a film's key frames, each a `ViewState` at a time, and the states between them.
 
-Numbers follow monotone cubics (base/smooth.py), so what is allowed at the keys is allowed between
+Numbers follow monotone cubics (smooth.py), so what is allowed at the keys is allowed between
 them: opacities, clips, lights, exposure, all floats of the state's JSON. The camera moves as
 `cameras/motion.py` describes; its field of view is interpolated like any number. The points of a
 transfer function slide if all keys have the same number of them; else the functions are resampled
@@ -24,10 +24,10 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import one_line
-from ..base.smooth import Smooth
 from ..base.whole_file import write_text
 from ..cameras import Camera
 from ..cameras.motion import Motion
+from .smooth import Smooth
 from .state import Eye, ViewState, saved_state
 
 Curve = Callable[[float], Any]
@@ -70,18 +70,16 @@ class Flight:
         for n, (previous, time) in enumerate(pairwise(times), 1):
             if time <= previous:
                 raise ValueError(f"Flight: key {n} at {time:g} s must come after {previous:g} s")
-        if any(state.camera is None for state in states):
-            n = next(n for n, state in enumerate(states) if state.camera is None)
-            raise ValueError(f"Flight: key {n} has no camera")
+        cameras = [state.camera for state in states]
+        if None in cameras:
+            raise ValueError(f"Flight: key {cameras.index(None)} has no camera")
         self.keys = list(zip(times, states, strict=True))
         self._times, self._states = times, states
         contents = [state.changed(state.to_json()).to_json() for state in states]  # 1 becomes 1.0
         self.closed = len(keys) > 2 and contents[0] == contents[-1]
-        fields = [
-            {name: content[name] for name in content if name != "camera"} for content in contents
-        ]
+        fields = [{n: value for n, value in c.items() if n != "camera"} for c in contents]
         self._content_curve = _curve(times, fields, self.closed)
-        eyes = [state.camera for state in states if state.camera is not None]
+        self._eyes = eyes = [camera for camera in cameras if camera is not None]
         self._motion = Motion(times, [_pose(eye) for eye in eyes], self.closed)
         self._fov_curve = Smooth(times, [np.array(eye.fov) for eye in eyes], self.closed)
 
@@ -143,9 +141,7 @@ class Flight:
         n = bisect_right(self._times, time) - 1
         if n < 0 or self._times[n] == time or n == len(self._times) - 1:
             return self._states[max(n, 0)]
-        key_camera = self._states[n].camera
-        assert key_camera is not None
-        eye = _eye(self._motion.at(time), float(self._fov_curve.at(time)), key_camera)
+        eye = _eye(self._motion.at(time), float(self._fov_curve.at(time)), self._eyes[n])
         try:
             state = self._states[n].changed(self._content_curve(time))
         except ValueError as error:
@@ -177,7 +173,6 @@ class Flight:
         return max(1, round(self.seconds * fps) + (not self.closed))
 
     def __len__(self) -> int:
-        """Number of keys."""
         return len(self.keys)
 
     def __repr__(self) -> str:
@@ -264,9 +259,8 @@ def _pose(eye: Eye) -> Tensor:
 def _eye(pose: Tensor, fov: float, previous: Eye) -> Eye:
     """Returns the camera of a pose, with the camera model of the key before."""
     down, forward, origin = pose[:3, 1], pose[:3, 2], pose[:3, 3]
-    eye, target, up = (
-        tuple(vector.tolist()) for vector in (origin - forward, origin, -down / down.norm())
-    )
+    vectors = (origin - forward, origin, -down / down.norm())
+    eye, target, up = (tuple(vector.tolist()) for vector in vectors)
     return Eye(eye=eye, target=target, up=up, fov=fov, model=previous.model)
 
 

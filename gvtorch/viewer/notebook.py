@@ -9,16 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import re
 from typing import Any
 
 from ..base.messages import need_library
 from .client import Client, image_file
 from .server import page_files
 from .session import Session
-
-_ENTRY_MODULE = "app.js"
-_IMPORT = re.compile(r'from "\./([a-z]+\.js)"')
 
 #: Makes modules of the page's texts, and mounts it with the notebook's model as its transport.
 _LOADER = """
@@ -58,13 +54,8 @@ export default {
 def module_text() -> str:
     """Returns the whole page as one JavaScript module."""
     files = {name: data.decode() for name, data in page_files().items() if name.endswith(".js")}
-    modules, pending = {}, [_ENTRY_MODULE]
-    while pending:
-        name = pending.pop()
-        if name not in modules:
-            modules[name] = files[name]
-            pending += _IMPORT.findall(files[name])
-    return _LOADER % json.dumps(modules)
+    del files["main.js"]  # the transport of a served page
+    return _LOADER % json.dumps(files)
 
 
 def widget(session: Session) -> Any:

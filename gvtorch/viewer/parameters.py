@@ -77,11 +77,7 @@ class Parameters:
 
     def _tensors(self) -> dict[str, torch.nn.Parameter]:
         named = self.producer.named_parameters()
-        return {
-            name: parameter
-            for name, parameter in named
-            if parameter.is_floating_point() and parameter.numel() <= _MAX_NUMBERS
-        }
+        return {n: p for n, p in named if p.is_floating_point() and p.numel() <= _MAX_NUMBERS}
 
     def set(self, name: str, value: Any, scene: Scene) -> None:
         """Sets a parameter, and has the scene produced again.

@@ -18,7 +18,7 @@ from .schema import decode
 from .state import Eye
 
 MAX_MESSAGE_BYTES = 1 << 20  # largest message from a page
-_SIDE_RANGE = (16, 8192)  # pixels
+_MIN_SIDE = 16  # pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +31,7 @@ class Hello:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            check.integer(
-                "hello", name, getattr(self, name), low=_SIDE_RANGE[0], high=_SIDE_RANGE[1]
-            )
+            check.integer("hello", name, getattr(self, name), low=_MIN_SIDE, high=8192)
         check.number("hello", "rate", self.rate, low=1, high=240)
 
 
@@ -163,7 +161,7 @@ class Still:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            check.integer("still", name, getattr(self, name), low=_SIDE_RANGE[0], high=16384)
+            check.integer("still", name, getattr(self, name), low=_MIN_SIDE, high=16384)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -80,17 +80,13 @@ class Scene:
 
     @property
     def trees(self) -> list[N3Tree]:
-        """All trees."""
         if self.engine is not None:
-            return [entry.tree for entry in self.engine.trees.values()]
+            return [source.tree for source in self.engine.trees.values()]
         return [] if self.tree is None else [self.tree]
 
     @property
     def producers(self) -> list[Producer]:
-        """The producers of the engine's trees."""
-        return (
-            [] if self.engine is None else [entry.producer for entry in self.engine.trees.values()]
-        )
+        return [] if self.engine is None else [s.producer for s in self.engine.trees.values()]
 
     def frame(self, camera: Camera, state: ViewState, progress: Progress = no_progress) -> Picture:
         """Renders with the data that is loaded now; what is missing is requested."""
@@ -314,12 +310,10 @@ def open_scene(what: Any, **options: Any) -> Scene:
         return Scene(repr(what), *((what, None) if isinstance(what, Engine) else (None, what)))
     options.setdefault("time_budget", _BUDGET_MS)
     options.setdefault("device", device_of("auto"))
-    if isinstance(what, Mapping) and all(
-        isinstance(producer, Producer) for producer in what.values()
-    ):
-        return Scene(", ".join(what), Engine(what, **options), remake=lambda _: what)
-    if isinstance(what, Producer):
-        return Scene(repr(what), Engine(what, **options), remake=lambda _: what)
+    is_several = isinstance(what, Mapping) and all(isinstance(p, Producer) for p in what.values())
+    if is_several or isinstance(what, Producer):
+        name = ", ".join(what) if is_several else repr(what)
+        return Scene(name, Engine(what, **options), remake=lambda _: what)
     data = _open_data(what)
     options.setdefault("border", data.info.default_border)
     return streamed_scene(data, _producer_of, series_of(what), **options)

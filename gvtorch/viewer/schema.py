@@ -129,9 +129,8 @@ def encode(value: Any) -> Any:
     if isinstance(value, Enum):
         value = value.value
     elif isinstance(value, (np.ndarray, np.generic, Tensor)):
-        is_small = (
-            max(value.shape, default=0) <= MAX_ITEMS and math.prod(value.shape) <= _MAX_NUMBERS
-        )
+        side, count = max(value.shape, default=0), math.prod(value.shape)
+        is_small = side <= MAX_ITEMS and count <= _MAX_NUMBERS
         value = value.tolist() if is_small else _kept_marker(value)
     elif isinstance(value, Set):
         value = sorted(value)
@@ -158,15 +157,10 @@ def _encode_object(value: Any) -> dict[str, Any]:
 
 
 def _argument(owner: Any, name: str) -> Any:
-    reader = next(
-        (
-            _ARGUMENT_READERS[base.__name__, name]
-            for base in type(owner).__mro__
-            if (base.__name__, name) in _ARGUMENT_READERS
-        ),
-        None,
-    )
-    return getattr(owner, name) if reader is None else reader(owner)
+    for base in type(owner).__mro__:
+        if reader := _ARGUMENT_READERS.get((base.__name__, name)):
+            return reader(owner)
+    return getattr(owner, name)
 
 
 def _kept_marker(value: Any) -> dict[str, str]:
@@ -192,12 +186,12 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
         if current is not None:
             return current
         if hint is not Any:  # Any: JSON as it is
-            raise ValueError(
-                f"{path}: JSON can't represent what was here: {content['kept']!r:.200}"
-            )
+            kept = content["kept"]
+            raise ValueError(f"{path}: JSON can't represent what was here: {kept!r:.200}")
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    named = content.get("kind") if isinstance(content, dict) else None
     problems = []
-    for choice in sorted(choices, key=lambda choice: not _is_named(choice, content)):
+    for choice in sorted(choices, key=lambda choice: getattr(choice, "__name__", "") != named):
         try:
             return _decode_type(path, choice, content, current, depth)
         except _WrongType as error:
@@ -208,11 +202,6 @@ def decode(path: str, hint: Any, content: Any, current: Any = None, depth: int =
 
 class _WrongType(Exception):
     """The content is of another type."""
-
-
-def _is_named(hint: Any, content: Any) -> bool:
-    """Returns whether a class is the one that the content names."""
-    return isinstance(content, dict) and getattr(hint, "__name__", "") == content.get("kind")
 
 
 def _decode_type(path: str, hint: Any, content: Any, current: Any, depth: int) -> Any:
@@ -241,12 +230,9 @@ def _checked_simple(hint: Any, content: Any) -> Any:
             raise _WrongType(_TYPE_NAMES[hint])
     elif get_origin(hint) is Literal:
         choices = get_args(hint)
-        if not any(
-            content is choice or (type(content) is str and content == choice) for choice in choices
-        ):
-            raise _WrongType(
-                " or ".join("null" if choice is None else repr(choice) for choice in choices)
-            )
+        if not any(type(content) is type(choice) and content == choice for choice in choices):
+            names = ("null" if choice is None else repr(choice) for choice in choices)
+            raise _WrongType(" or ".join(names))
     elif hint is not Any:
         raise _WrongType("something else")
     return content
@@ -276,18 +262,14 @@ def _decode_sequence(path: str, hint: Any, content: Any, current: Any, depth: in
     fixed = get_origin(hint) is tuple and item_hints[1:] != (...,)
     if fixed and len(item_hints) != len(content):
         raise _WrongType(f"{len(item_hints)} items")
-    old_items = (
-        current if isinstance(current, (list, tuple)) and len(current) == len(content) else None
-    )
+    if not fixed:
+        item_hints = (item_hints[0] if item_hints else Any,) * len(content)
+    is_same_size = isinstance(current, (list, tuple)) and len(current) == len(content)
+    old_items = current if is_same_size else [None] * len(content)
+    rows = zip(item_hints, content, old_items, strict=True)
     items = [
-        decode(
-            f"{path}[{i}]",
-            item_hints[i] if fixed else (item_hints[0] if item_hints else Any),
-            item,
-            None if old_items is None else old_items[i],
-            depth + 1,
-        )
-        for i, item in enumerate(content)
+        decode(f"{path}[{i}]", item_hint, item, old_item, depth + 1)
+        for i, (item_hint, item, old_item) in enumerate(rows)
     ]
     return tuple(items) if get_origin(hint) is tuple else items
 
@@ -345,11 +327,8 @@ def control_for(hint: Any, owner: str = "", name: str = "") -> dict[str, Any]:
     `optional` if None is allowed. What has no control is of type "kept".
     """
     choices = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
-    controls = [
-        control
-        for choice in choices
-        if (control := _describe_hint(choice, owner, name)) is not None
-    ]
+    descriptions = (_describe_hint(choice, owner, name) for choice in choices)
+    controls = [description for description in descriptions if description is not None]
     optional = any(choice in (None, type(None)) for choice in choices)
     if not controls:
         return {"type": "kept"}
@@ -390,11 +369,8 @@ def _describe_class(hint: type) -> dict[str, Any] | None:
     if issubclass(hint, Enum):
         return {"type": "choice", "choices": [member.value for member in hint]}
     if hint in (Shader, Background):
-        objects = [
-            {"type": "object", "kind": name}
-            for name, kind in KINDS.items()
-            if issubclass(kind, hint)
-        ]
+        names = (name for name, kind in KINDS.items() if issubclass(kind, hint))
+        objects = [{"type": "object", "kind": name} for name in names]
         return objects[0] if len(objects) == 1 else {"type": "one of", "choices": objects}
     if hint in KINDS.values() or is_dataclass(hint):
         return {"type": "object", "kind": hint.__name__}
@@ -410,9 +386,8 @@ def _slider_range(owner: str, name: str) -> tuple[float, float] | None:
     names = [base.__name__ for base in kind.__mro__] if kind is not None else [owner]
     if kind is not None and issubclass(kind, Shader):
         names.append("Lit")
-    return next(
-        (SLIDERS[class_name, name] for class_name in names if (class_name, name) in SLIDERS), None
-    )
+    ranges = (SLIDERS.get((class_name, name)) for class_name in names)
+    return next(filter(None, ranges), None)
 
 
 def describe_kind(kind: type) -> dict[str, Any]:

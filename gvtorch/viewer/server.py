@@ -18,6 +18,7 @@ import socket
 import threading
 from collections.abc import Iterable
 from concurrent.futures import Future
+from functools import partial
 from importlib import resources
 from typing import Any
 from urllib.parse import urlencode, urlsplit
@@ -120,7 +121,6 @@ class Server:
         return f"http://{host}:{self.port}/{query}"
 
     def close(self) -> None:
-        """Stops the server."""
         if self._loop.is_running():
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(timeout=10)
@@ -153,13 +153,8 @@ class Server:
             await runner.cleanup()
 
     def _application(self) -> Any:
-        web = self._web
-
-        @web.middleware
-        async def guard(request: Any, handler: Any) -> Any:
-            return await self._guard_request(request, handler)
-
-        app = web.Application(middlewares=[guard])
+        guard = partial(self._guard_request)  # aiohttp marks it, which a method does not allow
+        app = self._web.Application(middlewares=[self._web.middleware(guard)])
         app.router.add_get("/", self._serve_page)
         app.router.add_get("/ws", self._serve_socket)
         app.router.add_get("/{name}", self._serve_page)

@@ -61,7 +61,6 @@ class Session:
     def __init__(
         self, scene: Scene, state: ViewState, parameters: Parameters | None = None
     ) -> None:
-        """Takes a scene, which only the session's thread uses from now on."""
         self.scene, self.state, self.parameters = scene, state, parameters
         self.clients: dict[int, Client] = {}
         self._last_good_state = state  # the last state that was drawn
@@ -93,7 +92,6 @@ class Session:
         return client
 
     def leave(self, client: Client) -> None:
-        """Forgets a page."""
         client.gone = True
         self.post(lambda: self._goodbye(client))
 
@@ -171,7 +169,7 @@ class Session:
         for future in list(self._questions):
             if not future.done():
                 future.set_exception(RuntimeError("view: it is closed"))
-        self._stills.clear()
+        self._stills = Stills()
         self.scene.close()
 
     def _step(self) -> bool:
@@ -276,9 +274,8 @@ class Session:
     def _frame_figures(self, picture: Picture) -> dict[str, Any]:
         stats = picture.stats.as_dict()
         names = ("milliseconds", "stages", "rays", "samples", "bricks_used", "tiles_used")
-        figures = {name: stats[name] for name in names}
-        optional = ("requests", "misses", "produced", "evicted", "miss_rate", "pending", "failed")
-        figures |= {name: stats[name] for name in optional if name in stats}
+        of_streams = ("requests", "misses", "produced", "evicted", "miss_rate", "pending", "failed")
+        figures = {name: stats[name] for name in (*names, *of_streams) if name in stats}
         engine = self.scene.engine
         if engine is not None:
             report = engine.report().as_dict()
@@ -291,6 +288,7 @@ class Session:
     def _welcome(self, client: Client) -> None:
         self.clients[client.number] = client
         box, info = self.scene.box.tolist(), self.scene.info
+        stored_channels = self.scene.trees[0].bricks.channels
         client.send_message(
             "welcome",
             client=client.number,
@@ -300,9 +298,7 @@ class Session:
             time=self.scene.describe_time(),
             labels=self.scene.describe_labels(),
             channels=[channel.name for channel in info.channels],
-            widths={
-                name: channel.width for name, channel in self.scene.trees[0].bricks.channels.items()
-            },
+            widths={name: channel.width for name, channel in stored_channels.items()},
             **self._state_content(),
             schema=schema(),
             models={
@@ -414,28 +410,34 @@ class Session:
             self.scene.set_clocks(time_point)
             return
         self._pending_time = time_point
-        thread = threading.Thread(target=self._read_time, args=(time_point,), daemon=True)
-        thread.start()
+        threading.Thread(target=self._read_time, args=(time_point,), daemon=True).start()
 
     def _read_time(self, time_point: float) -> None:
         """Reads a time point, in its own thread, so that rendering goes on."""
         assert self.scene.reopen is not None
+        data: Volume | Store | Exception
         try:
             data = self.scene.reopen(int(time_point))
         except Exception as error:  # whatever it was, the view goes on
-            failure = error
-            self.post(lambda: self._time_failed(time_point, failure))
-        else:
-            self.post(lambda: self._time_arrived(time_point, data))
+            data = error
+        self.post(lambda: self._time_arrived(time_point, data))
 
-    def _time_arrived(self, time_point: float, data: Volume | Store) -> None:
+    def _time_arrived(self, time_point: float, data: Volume | Store | Exception) -> None:
+        """Shows a time point. If it can't be read or shown, sets the state back to the time that is
+        shown, unless it wants another one meanwhile.
+        """
         self._pending_time = None
         try:
+            if isinstance(data, Exception):
+                raise data
             self.scene.show_time(time_point, data)
         except Exception as error:  # whatever it was, the view goes on
-            self._time_failed(time_point, error)
-            return
-        self._show_new_data()
+            self._broadcast("error", text=f"time {time_point:g}: {one_line(error)}")
+            if self.state.time == time_point:
+                self.state = replace(self.state, time=self.scene.time)
+                self._broadcast_state(None)
+        else:
+            self._show_new_data()
         self._update_time()
 
     def _show_new_data(self) -> None:
@@ -445,15 +447,6 @@ class Session:
             self._planes.close()
             self._planes = None
             self._open_planes(self.state)
-
-    def _time_failed(self, time_point: float, error: Exception) -> None:
-        """Sets the state back to the time that is shown, unless it wants another one meanwhile."""
-        self._pending_time = None
-        self._broadcast("error", text=f"time {time_point:g}: {one_line(error)}")
-        if self.state.time == time_point:
-            self.state = replace(self.state, time=self.scene.time)
-            self._broadcast_state(None)
-        self._update_time()
 
     def _take_pick(self, client: Client, message: protocol.Pick) -> None:
         position = client.position_at(message.x, message.y)
@@ -477,8 +470,7 @@ class Session:
         client.send_message("preset", name=name, function=encode(function), colors_only=colors_only)
 
     def _take_read(self, client: Client, message: protocol.Read) -> None:
-        arguments = message.file, message.text, message.name, message.low, message.high
-        function, notes = read_function(*arguments)
+        function, notes = read_function(**vars(message))
         name = message.name or message.file
         client.send_message("preset", name=name, function=encode(function), lost=notes)
 
@@ -486,8 +478,7 @@ class Session:
         transfer = transfer_of(self.state.shader)
         if transfer is None:
             raise ValueError("export: there is no transfer function")
-        text = transfer.to_paraview(message.name)
-        client.send_file("paraview.json", text.encode())
+        client.send_file("paraview.json", transfer.to_paraview(message.name).encode())
 
     def _take_nodes(self, client: Client, message: protocol.Nodes) -> None:
         client.nodes = message.on
@@ -573,12 +564,5 @@ class Session:
 
 def schema() -> dict[str, Any]:
     """Returns the description that the page makes its controls of: the fields of each class."""
-    kinds = {**KINDS, **{kind.__name__: kind for kind in (Eye, Development, Slices, ViewState)}}
-    descriptions = {name: describe_kind(kind) for name, kind in kinds.items()}
-    descriptions["EngineOptions"] = describe_kind(EngineOptions)
-    descriptions["EngineOptions"]["fields"] = {
-        name: field
-        for name, field in descriptions["EngineOptions"]["fields"].items()
-        if name in _ENGINE_OPTIONS
-    }
-    return descriptions
+    kinds = (*KINDS.values(), Eye, Development, Slices, ViewState, EngineOptions)
+    return {kind.__name__: describe_kind(kind) for kind in kinds}

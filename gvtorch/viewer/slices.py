@@ -74,6 +74,8 @@ class Planes:
         reason why it can't be.
         """
         self.data, self._on_read = data, on_read
+        self._low = np.array(data.origin) - np.array(data.spacing) / 2  # world corners
+        self._high = self._low + np.array(data.spacing) * np.array(data.extent)
         self._images: OrderedDict[Any, np.ndarray] = OrderedDict()
         self._newest_images: dict[str, np.ndarray] = {}  # by axis
         self._failed: set[Any] = set()
@@ -87,17 +89,15 @@ class Planes:
     @cached_property
     def views(self) -> dict[str, PlaneView]:
         """The view of each plane: radiological if the data's anatomical directions are known."""
-        return radiological_views(self.data.info.space) or {
-            axis: PlaneView("", up) for axis, up in UP.items()
-        }
+        plain_views = {axis: PlaneView("", up) for axis, up in UP.items()}
+        return radiological_views(self.data.info.space) or plain_views
 
     def position(self, state: ViewState) -> tuple[float, float, float]:
         """Returns the world position through which the planes go, clamped to the data."""
-        low, high = self._corners()
-        position = (low + high) / 2
+        position = (self._low + self._high) / 2
         if state.slices is not None and state.slices.position is not None:
             position = np.array(state.slices.position)
-        x, y, z = np.clip(position, low, high).tolist()
+        x, y, z = np.clip(position, self._low, self._high).tolist()
         return x, y, z
 
     def index(self, axis: str, state: ViewState) -> int:
@@ -105,11 +105,6 @@ class Planes:
         n = "xyz".index(axis)
         voxel = (self.position(state)[n] - self.data.origin[n]) / self.data.spacing[n]
         return min(max(int(np.floor(voxel + 0.5)), 0), self.data.extent[n] - 1)
-
-    def _corners(self) -> tuple[np.ndarray, np.ndarray]:
-        spacing, extent = np.array(self.data.spacing), np.array(self.data.extent)
-        low = np.array(self.data.origin) - spacing / 2
-        return low, low + spacing * extent
 
     def composed(
         self, picture: Picture, state: ViewState, width: int, height: int, wait: bool = False
@@ -119,8 +114,7 @@ class Planes:
         Args:
             picture: Developed, of the size of its part or smaller.
             state: Has the position of the planes, and their colours.
-            width: Pixels.
-            height: Pixels.
+            width, height: Pixels.
             wait: Whether to wait for voxels; else the last planes are shown until the new are read.
 
         Raises:
@@ -136,9 +130,8 @@ class Planes:
         for axis in "xyz":
             image, is_current = self._image(axis, state, pixel_size, wait)
             complete &= is_current
-            layout[axis] = self._plane_layout(axis, parts[axis], pixel_size) | {
-                "position": self.position(state)
-            }
+            layout[axis] = self._plane_layout(axis, parts[axis], pixel_size)
+            layout[axis]["position"] = self.position(state)
             if image is not None:
                 _paste(color, Pane(*layout[axis]["image"]), torch.from_numpy(image))
         ones = torch.ones(height, width, 1, device="cpu")
@@ -160,8 +153,7 @@ class Planes:
 
     def _pixel_size(self, axis: str, pane: Pane) -> float:
         """Returns the world size of a pixel at which a plane fits its part."""
-        low, high = self._corners()
-        size = dict(zip("xyz", high - low, strict=True))
+        size = dict(zip("xyz", self._high - self._low, strict=True))
         column, row = self._sides(axis)
         return float(max(size[column] / pane.width, size[row] / pane.height))
 
@@ -176,7 +168,8 @@ class Planes:
         """Returns the layout of a plane: which part of the picture it takes, where its image lies
         in that part, and its edges in world coordinates.
         """
-        low, high = (dict(zip("xyz", corner.tolist(), strict=True)) for corner in self._corners())
+        corners = (self._low.tolist(), self._high.tolist())
+        low, high = (dict(zip("xyz", corner, strict=True)) for corner in corners)
         column, row = self._sides(axis)
         view = self.views[axis]
         width = min(pane.width, max(1, round((high[column] - low[column]) / pixel_size)))
@@ -246,7 +239,6 @@ class Planes:
         return state.slices.window, shader, state.component
 
     def _render_plane(self, axis: str, state: ViewState, pixel_size: float) -> np.ndarray:
-        """Reads and colours a plane."""
         assert state.slices is not None
         level, sides = self._level(axis, pixel_size), self._sides(axis)
         voxel_size = min(self.data.spacing["xyz".index(n)] for n in sides) * 2**level
@@ -270,8 +262,7 @@ class Planes:
 
     def _auto_window(self, component: int) -> tuple[float, float]:
         if component not in self._windows:
-            limits = window(self.data, component=component, background=True)
-            self._windows[component] = limits
+            self._windows[component] = window(self.data, component=component, background=True)
         return self._windows[component]
 
     def _colors(self, state: ViewState) -> Callable[[np.ndarray], np.ndarray] | None:
@@ -279,12 +270,9 @@ class Planes:
         assert state.slices is not None
         if self.data.info.labels:
             shader = state.shader if isinstance(state.shader, Labels) else Labels()
-            label_values = self.data.label_values
-            return (
-                shader
-                if label_values is None
-                else lambda values: shader(label_values.numpy()[values])
-            )
+            if (label_values := self.data.label_values) is None:
+                return shader
+            return lambda values: shader(label_values.numpy()[values])
         if state.slices.colors == "gray":
             return None
         return transfer_of(state.shader)

@@ -101,13 +101,9 @@ class Eye:
         else:
             is_planar = MODELS[model].planar
             fov = math.degrees(2 * math.atan(half_height) if is_planar else 2 * half_height)
-        target = eye + distance * forward
-        triples = (tuple(vector.tolist()) for vector in (eye, target, -rotation[1]))
-        return cls(
-            **dict(zip(("eye", "target", "up"), triples, strict=True)),
-            fov=round(fov, 9),
-            model=model,
-        )
+        vectors = {"eye": eye, "target": eye + distance * forward, "up": -rotation[1]}
+        triples: Any = {name: tuple(vector.tolist()) for name, vector in vectors.items()}
+        return cls(**triples, fov=round(fov, 9), model=model)
 
     @classmethod
     def first(cls, box: Tensor, width: int, height: int, up: Up = "+y") -> Self:
@@ -244,17 +240,15 @@ class ViewState:
 
         Args:
             what: A resident tree; or an engine, until nothing is missing.
-            width: Pixels.
-            height: Pixels.
+            width, height: Pixels.
 
         Raises:
             ValueError: The state has no camera, or shows costs: see `gv.cost`.
         """
-        if self.camera is None or self.show != "picture":
-            requirement = (
-                "a camera" if self.camera is None else f"show='picture', not {self.show!r}"
-            )
-            raise ValueError(f"ViewState.picture: the state must have {requirement}")
+        if self.camera is None:
+            raise ValueError("ViewState.picture: the state must have a camera")
+        if self.show != "picture":
+            raise ValueError(f"ViewState.picture: must show 'picture', not {self.show!r}")
         renderer = what.render if isinstance(what, Engine) else partial(render, what)
         return self.taken(renderer, self.camera.camera(width, height, what.box))
 
@@ -310,8 +304,7 @@ class ViewState:
         """Writes a .json file."""
         if Path(path).suffix != ".json":
             raise ValueError(f"state: path must end in .json, got {str(path)!r}")
-        text = json.dumps(self.to_json(), indent=1)
-        write_text(Path(path), text + "\n")
+        write_text(Path(path), json.dumps(self.to_json(), indent=1) + "\n")
 
     def read(self, path: str | Path) -> ViewState:
         """Returns the state with the fields of a .json file in place of its own.

@@ -72,9 +72,6 @@ class Stills:
             raise ValueError("still: one is being made already")
         self._waiting.append((client, steps))
 
-    def clear(self) -> None:
-        self._waiting.clear()
-
     def run_step(self) -> None:
         """Runs the next step of the first still in the queue; sends it if that was the last."""
         client, steps = self._waiting.popleft()

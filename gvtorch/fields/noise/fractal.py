@@ -171,11 +171,8 @@ def warp(points: Points, *, amplitude: float = 1.0, **settings: Unpack[SumSettin
     seed = check.integer("noise.warp", "seed", settings.get("seed", 0), low=-MOST_SEED, high=most)
     shifts = []
     for axis in range(position.shape[-1]):
-        axis_settings: SumSettings = {
-            "octaves": 1,
-            **settings,
-            "seed": seed + (axis + 1) * _NEXT_AXIS,
-        }
+        axis_seed = seed + (axis + 1) * _NEXT_AXIS
+        axis_settings: SumSettings = {"octaves": 1, **settings, "seed": axis_seed}
         shifts.append(fbm(position, **axis_settings))
     return position + amplitude * torch.stack(shifts, -1)
 

@@ -57,9 +57,8 @@ def inherit(
     """
     context = "noise.inherit"
     if parents.dim() != 4 or len(set(parents.shape[1:])) > 1 or not parents.is_floating_point():
-        raise ValueError(
-            f"{context}: parents must be (k, s, s, s) floats, got {check.describe(parents)}"
-        )
+        got = check.describe(parents)
+        raise ValueError(f"{context}: parents must be (k, s, s, s) floats, got {got}")
     if child.shape != (len(parents), 3):
         shape = f"({len(parents)}, 3)"
         raise ValueError(f"{context}: child must be {shape} int64, got {check.describe(child)}")
@@ -183,12 +182,9 @@ def _weights(
             position = (child * size + voxel + 0.5) / branching - 0.5 + border  # in parent's voxels
             first = min(max(int(position) - points // 2 + 1, 0), side - points)
             row = [0.0] * side
-            for index in range(first, first + points):
-                weight = 1.0
-                for other_index in range(first, first + points):
-                    if other_index != index:
-                        weight *= (position - other_index) / (index - other_index)
-                row[index] = weight
+            used = range(first, first + points)
+            for n in used:
+                row[n] = math.prod((position - other) / (n - other) for other in used if other != n)
             rows.append(row)
         children.append(rows)
     return torch.tensor(children, dtype=dtype, device=device)

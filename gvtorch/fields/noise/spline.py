@@ -58,8 +58,7 @@ class SplineSum(EvaluationCounter):
         Raises:
             ValueError: A number is out of its range.
         """
-        context = "noise.SplineSum"
-        self.octaves = octaves_of(context, octaves, 2.0, gain, seed, frequency)
+        self.octaves = octaves_of("noise.SplineSum", octaves, 2.0, gain, seed, frequency)
 
     def held(self, side: float) -> list[Octave]:
         """Returns the octaves that voxels of a side, in world units, can represent."""
@@ -97,9 +96,7 @@ class SplineSum(EvaluationCounter):
             values = self._sum_from_coarsest(low, size, side)
         else:
             inner = size - 2 * border
-            parent_low = [
-                (coordinate + border) // inner // 2 * inner - border for coordinate in low
-            ]
+            parent_low = [(start + border) // inner // 2 * inner - border for start in low]
             values = self._add_octave(_refine(parents, parent_low, low, size), low, side)
         self._count(plain_evaluations=len(values) * self._random_count(size, side))
         return values, values

@@ -17,7 +17,7 @@ export class ClipEditor {
   }
 
   get inWorld() {
-    return this.clip.frame === "world";
+    return (this.clip ?? NO_CLIP).frame === "world";
   }
 
   get side() {
@@ -28,8 +28,9 @@ export class ClipEditor {
     return centreOf(this.app.box);
   }
 
-  toBox(position) {
-    return times(sub(position, this.middle), 1 / this.side);
+  /** A world position in the frame of the clip. */
+  toClip(position) {
+    return this.inWorld ? position : times(sub(position, this.middle), 1 / this.side);
   }
 
   /** The box of the clip in the world, or null. */
@@ -53,16 +54,14 @@ export class ClipEditor {
   }
 
   setCrop(on) {
-    const clip = this.clip ?? NO_CLIP;
-    const corners = this.app.box.map((point) => (clip.frame === "world" ? point : this.toBox(point)));
-    this.setClip({ ...clip, boxes: on ? [corners] : [] }, true);
+    const corners = this.app.box.map((point) => this.toClip(point));
+    this.setClip({ ...(this.clip ?? NO_CLIP), boxes: on ? [corners] : [] }, true);
   }
 
   addPlane() {
     const { app } = this, { forward } = axes(app.camera), { target } = app.camera;
     const clip = this.clip ?? NO_CLIP;
-    const point = clip.frame === "world" ? target : this.toBox(target);
-    this.setClip({ ...clip, planes: [...clip.planes, [...forward, -dot(forward, point)]] }, true);
+    this.setClip({ ...clip, planes: [...clip.planes, [...forward, -dot(forward, this.toClip(target))]] }, true);
   }
 
   setPlane(n, numbers, rest) {
@@ -80,7 +79,7 @@ export class ClipEditor {
     const scale = this.inWorld ? 1 : 1 / this.side;
     const minThickness = this.side * 0.01 * scale;
     const moved = box[side][axis] + amount * scale;
-    const limit = app.box.map((point) => (this.inWorld ? point : this.toBox(point))[axis]);
+    const limit = app.box.map((point) => this.toClip(point)[axis]);
     box[side][axis] = side ? clamp(moved, box[0][axis] + minThickness, limit[1]) : clamp(moved, limit[0], box[1][axis] - minThickness);
     this.setClip({ ...clip, boxes: [box, ...clip.boxes.slice(1)] }, false);
   }

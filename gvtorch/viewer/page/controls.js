@@ -1,5 +1,5 @@
 // Controls made from the schema: each by the type and range of a field, whatever its class.
-import { el, textButton } from "./dom.js";
+import { el, menu, textButton } from "./dom.js";
 import { hex, linear } from "./vectors.js";
 
 /** The name of a field or a class in words: "cap_light" is "cap light", "PointLight" is "Point light". */
@@ -57,11 +57,8 @@ export class Controls {
   }
 
   choice(choices, value, set, optional) {
-    const options = optional ? [null, ...choices] : choices;
-    const select = el("select", { onchange: () => set(options[select.selectedIndex], true) },
-      ...options.map((option) => el("option", {}, option === null ? "–" : spaced(String(option)))));
-    select.selectedIndex = Math.max(0, options.indexOf(value ?? null));
-    return select;
+    const name = (option) => (option === null ? "–" : spaced(String(option)));
+    return menu(optional ? [null, ...choices] : choices, name, value ?? null, (option) => set(option, true));
   }
 
   color(value, set) {
@@ -114,12 +111,8 @@ export class Controls {
     const kindOf = (item) => kinds.find((kind) => (kind.type === "object" ? kind.kind === item?.kind : kind.type === "color" ? Array.isArray(item) : typeof item === "string"));
     const current = value === null || value === undefined ? null : kindOf(value) ?? null;
     const options = (field.optional ? [null, ...kinds] : kinds).filter(fits);
-    const select = el("select", { title: field.text ?? "" }, ...options.map((kind) => el("option", {}, kind ? spaced(label(kind)) : "none")));
-    select.selectedIndex = Math.max(0, options.indexOf(current));
-    select.onchange = () => {
-      const chosen = options[select.selectedIndex];
-      set(chosen ? (chosen.type === "object" ? this.newObject(chosen.kind, name) : chosen.type === "color" ? [0, 0, 0] : "") : null, true);
-    };
+    const newValue = (kind) => (kind.type === "object" ? this.newObject(kind.kind, name) : kind.type === "color" ? [0, 0, 0] : "");
+    const select = menu(options, (kind) => (kind ? spaced(label(kind)) : "none"), current, (kind) => set(kind ? newValue(kind) : null, true), field.text ?? "");
     const header = el("label.gv-row", { title: field.text ?? "" }, el("span.gv-name", {}, spaced(name)));
     if (current && current.type === "color") {
       header.append(options.length > 1 ? el("span.gv-both", {}, select, this.color(value, set)) : this.color(value, set));

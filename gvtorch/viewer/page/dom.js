@@ -54,6 +54,13 @@ export function iconButton(name, title, onclick) {
 /** A small button with a text. */
 export const textButton = (text, title, onclick) => el("button.gv-small", { type: "button", title, onclick }, text);
 
+/** A menu of options, each shown as `name(option)`; `choose` takes the one that is chosen. */
+export function menu(options, name, current, choose, title = "") {
+  const select = el("select", { title, onchange: () => choose(options[select.selectedIndex]) }, ...options.map((option) => el("option", {}, name(option))));
+  select.selectedIndex = Math.max(0, options.indexOf(current));
+  return select;
+}
+
 /** Saves a file that the page made. */
 export function saveFile(name, content, type) {
   const url = URL.createObjectURL(new Blob([content], { type }));

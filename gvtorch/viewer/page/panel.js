@@ -1,7 +1,7 @@
 // The panel: sections of controls for every part of the state.
 import { Controls, spaced } from "./controls.js";
 import { axes } from "./camera.js";
-import { el, textButton } from "./dom.js";
+import { el, menu, textButton } from "./dom.js";
 import { LabelTable } from "./labels.js";
 import { TransferEditor, domain } from "./transfer.js";
 
@@ -94,7 +94,6 @@ export class Panel {
 
   colours() {
     const { app, editor } = this;
-    const tick = (text, checked, onchange) => el("label.gv-tick", {}, el("input", { type: "checkbox", checked, onchange: (e) => onchange(e.target.checked) }), text);
     const { pick, buttons, saveBar } = app.presets.rows();
     return [
       editor.element,
@@ -126,8 +125,7 @@ export class Panel {
     const kinds = app.schema.ViewState.fields.shader.choices.map((choice) => choice.kind);
     if (shader.kept) return [el("div.gv-row", {}, el("span.gv-name", {}, "shader"), el("span.gv-dim", {}, shader.kept.split("(")[0]))];
     const offered = kinds.filter((kind) => app.offers(kind) || kind === shader.kind);
-    const select = el("select", { onchange: () => change(this.newObject(offered[select.selectedIndex], "shader"), true) }, ...offered.map((kind) => el("option", {}, spaced(kind))));
-    select.selectedIndex = offered.indexOf(shader.kind);
+    const select = menu(offered, spaced, shader.kind, (kind) => change(this.newObject(kind, "shader"), true));
     const rows = this.controls.fields(shader, change, { without: ["transfer", "looks", ...(shader.kind === "TransferFunction" ? ["opacity", "color"] : ["channel", "normals", "visible", "color_channel", "color_component"])] });
     return [el("label.gv-row", {}, el("span.gv-name", {}, "shader"), select), ...rows, this.surface()];
   }
@@ -143,25 +141,23 @@ export class Panel {
 
   showing() {
     const { app } = this;
-    const tick = (name, text) => el("label.gv-tick", {}, el("input", { type: "checkbox", checked: app.overlays[name], onchange: (e) => { app.overlays[name] = e.target.checked; app.view.drawOverlay(); } }), text);
+    const overlay = (name, text) => tick(text, app.overlays[name], (on) => { app.overlays[name] = on; app.view.drawOverlay(); });
     const only = app.state.show === "picture" ? ["show"] : ["show", "blend"];
     const rows = this.controls.fields({ kind: "ViewState", ...app.state }, ({ show, blend }, rest) => app.change({ show, blend }, rest), { only });
-    const nodes = el("label.gv-tick", { title: "Boxes of the tree's nodes whose bricks the picture shows" }, el("input", { type: "checkbox", checked: app.overlays.nodes, onchange: (e) => { app.overlays.nodes = e.target.checked; app.nodes.show(e.target.checked); } }), "nodes");
-    return [...rows, el("div.gv-bar", {}, tick("axes", "axes"), tick("scale", "scale bar"), tick("box", "box"), nodes)];
+    const nodes = tick("nodes", app.overlays.nodes, (on) => { app.overlays.nodes = on; app.nodes.show(on); }, "Boxes of the tree's nodes whose bricks the picture shows");
+    return [...rows, el("div.gv-bar", {}, overlay("axes", "axes"), overlay("scale", "scale bar"), overlay("box", "box"), nodes)];
   }
 
   slices() {
     const { app } = this, { slices } = app.state;
-    const on = el("label.gv-row", {}, el("span.gv-name", {}, "three slices"),
-      el("input.gv-flag", { type: "checkbox", checked: !!slices, onchange: (e) => app.slices.show(e.target.checked) }));
+    const on = this.controls.row("three slices", { type: "flag" }, slices, (show) => app.slices.show(show));
     if (!slices) return [on];
     return [on, ...this.controls.fields(slices, (value, rest) => app.change({ slices: value }, rest))];
   }
 
   clip() {
     const { app } = this, { clip } = app, current = clip.clip;
-    const crop = el("label.gv-row", {}, el("span.gv-name", {}, "crop box"),
-      el("input.gv-flag", { type: "checkbox", checked: !!clip.cropBox(), onchange: (e) => clip.setCrop(e.target.checked) }));
+    const crop = this.controls.row("crop box", { type: "flag" }, clip.cropBox(), (on) => clip.setCrop(on));
     const planes = (current?.planes ?? []).flatMap((plane, index) => [
       el("div.gv-row", {}, el("span.gv-name", {}, `plane ${index + 1}`),
         this.controls.number({ type: "number", range: [-0.9, 0.9] }, plane[3], (d, rest) => clip.setPlane(index, [...plane.slice(0, 3), d], rest))),
@@ -187,10 +183,8 @@ export class Panel {
     const others = Object.keys(app.clients).map(Number).filter((number) => number !== app.number);
     const rows = this.controls.fields({ kind: "Eye", ...app.camera }, ({ kind, ...camera }, rest) => app.changeCamera(camera, rest));
     if (!others.length) return rows;
-    const choices = [null, ...others];
-    const select = el("select", { onchange: () => app.link.send("follow", { client: choices[select.selectedIndex] }) },
-      ...choices.map((number) => el("option", {}, number === null ? "nobody" : `page ${number}`)));
-    select.selectedIndex = Math.max(0, choices.indexOf(app.clients[app.number]));
+    const name = (number) => (number === null ? "nobody" : `page ${number}`);
+    const select = menu([null, ...others], name, app.clients[app.number] ?? null, (client) => app.link.send("follow", { client }));
     return [...rows, el("label.gv-row", {}, el("span.gv-name", {}, `follow (this is page ${app.number})`), select)];
   }
 
@@ -206,6 +200,9 @@ export class Panel {
     });
   }
 }
+
+/** A box to tick, with a text beside it; `onchange(on)`. */
+const tick = (text, checked, onchange, title = "") => el("label.gv-tick", { title }, el("input", { type: "checkbox", checked, onchange: (event) => onchange(event.target.checked) }), text);
 
 /** The channel that colours a surface: the present one if it fits, else the last that does; null: one fixed colour. */
 function colorChannel({ color, color_channel }, widths) {

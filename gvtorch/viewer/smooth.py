@@ -44,11 +44,10 @@ class Smooth:
         s = (time - self._times[n]) / span
         a, b = self._values[n : n + 2]
         slope_a, slope_b = span * self._slopes[n : n + 2]
-        interpolated = (
-            a + s * s * (3 - 2 * s) * (b - a) + s * (1 - s) * ((1 - s) * slope_a - s * slope_b)
-        )
+        bend = s * (1 - s) * ((1 - s) * slope_a - s * slope_b)
+        smooth = a + s * s * (3 - 2 * s) * (b - a) + bend
         # Rounding may leave the span.
-        return np.clip(interpolated, np.minimum(a, b), np.maximum(a, b))
+        return np.clip(smooth, np.minimum(a, b), np.maximum(a, b))
 
 
 def _slope(
