@@ -198,8 +198,8 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
 
 @pytest.mark.backend("cpp")
 def test_a_frame_that_finds_no_memory_leaves_the_pools_in_order(blobs):
-    """Each tensor operation fails in turn, in one engine; the next frames equal those of a faultless
-    one.
+    """In one engine each tensor operation fails in turn; the next frames equal those of a faultless
+    engine.
     """
     pools: dict[str, Any] = {"brick_size": 4, "brick_pool": 150 * 6**3 * 4, "node_pool": 9600}
     views = [gv.Camera.orbit(azimuth, 20, 0.8, None, 16, 12) for azimuth in (0, 90)]
