@@ -112,7 +112,7 @@ def test_a_conversion_goes_on_after_a_fault_at_any_call(tmp_path, monkeypatch, k
     with failing(-1, calls) as whole:
         convert(raw, tmp_path / "whole.zarr", workers=1)
     broken = 0
-    for number in (*range(6), *range(6, whole.calls, max(1, whole.calls // 10))):
+    for number in (*range(6), *range(6, whole.calls, max(1, whole.calls // 6))):
         target = tmp_path / f"{number}.zarr"
         try:
             with failing(number, calls, make_error):
