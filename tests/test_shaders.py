@@ -316,6 +316,7 @@ def assert_all_same(actual, expected):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", SHADERS)
 def test_script_compile_and_export(tree, compiled, name):
+    """Every other one is compiled: that takes longest, and traces the code that export traces."""
     torch._dynamo.reset()  # each tracer is a module of its own
     tracer, rays = module(tree, name, compiled)
     plain = tracer(*rays)
@@ -326,8 +327,9 @@ def test_script_compile_and_export(tree, compiled, name):
     torch.jit.save(torch.jit.script(tracer), file)
     file.seek(0)
     assert_all_same(torch.jit.load(file).hits(*rays), expected)
-    fast = torch.compile(tracer.hits, fullgraph=True, backend="aot_eager")
-    assert_all_same(fast(*rays), expected)
+    if [*SHADERS].index(name) % 2 == 0:
+        fast = torch.compile(tracer.hits, fullgraph=True, backend="aot_eager")
+        assert_all_same(fast(*rays), expected)
     program = torch.export.export(tracer, rays).module()
     assert all(torch.equal(a, b) for a, b in zip(program(*rays), plain, strict=True))
 
