@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
+from hypothesis import strategies
 
 import gvtorch as gv
 from gvtorch.ops import unavailable
@@ -96,13 +97,15 @@ def compiled(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(scope="session", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A temporary cache folder of compiled shaders: each is compiled once for all tests. torch
-    precompiles no header, because the tests compile too few graphs with its default backend.
+    precompiles no header, because the tests compile too few graphs with its default backend, and
+    takes the processor's word for its instruction sets, which it would prove by a compilation each.
     """
     with pytest.MonkeyPatch.context() as patch:
         base = tmp_path_factory.getbasetemp()
         folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cache"
         patch.setenv("GVTORCH_CACHE", str(folder))
         patch.setenv("TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS", "0")
+        patch.setenv("TORCHINDUCTOR_VEC_ISA_OK", "1")
         yield folder
 
 
@@ -115,6 +118,25 @@ def tokens_of_classes() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kind, "make", staticmethod(functools.cache(kind.make)))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def distributed_tensors() -> Iterator[None]:
+    """`assert_close` would import torch.distributed, for over a second, to find that there are no
+    distributed tensors.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.testing._comparison, "_HAS_DTENSOR", False, raising=False)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def characters(cache: Path) -> None:
+    """Hypothesis lists all characters and keeps the list on disk: one process makes it for all."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        with cache.with_name("characters.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            strategies.characters(codec="utf-8").validate()
 
 
 @pytest.fixture(scope="session")

@@ -130,24 +130,23 @@ def means(values: torch.Tensor, n: int) -> torch.Tensor:
 
 
 @functools.cache
-def halved(kind: str) -> dict[str, torch.Tensor]:
-    producer = KINDS[kind][0](2)
+def finest(kind: str, branching: int) -> tuple[Producer, Layout, dict[str, torch.Tensor]]:
+    """Returns a producer, its layout, and all voxels of its finest level."""
+    producer = KINDS[kind][0](branching)
     layout = layout_of(producer)
-    return level(producer, layout, layout.depth)
+    return producer, layout, level(producer, layout, layout.depth)
 
 
 @pytest.mark.parametrize("branching", [2, 3, 4])
 @pytest.mark.parametrize("kind", KINDS)
 def test_voxels_are_right_in_trees_of_any_n(kind, branching):
-    make, tolerance = KINDS[kind]
-    producer = make(branching)
-    layout = layout_of(producer)
+    tolerance = KINDS[kind][1]
+    producer, layout, fine = finest(kind, branching)
     assert producer.branching == branching and layout.depth == (4 if branching == 2 else 2)
     scale = {"coverage": 255.0, "distance": 2.0}
-    fine = level(producer, layout, layout.depth)
     for name, values in fine.items():
         if name != "inherited":
-            torch.testing.assert_close(values, halved(kind)[name], atol=1e-4, rtol=0)
+            torch.testing.assert_close(values, finest(kind, 2)[2][name], atol=1e-4, rtol=0)
             assert values.std() > 0.05 * scale.get(name, 1)
     for up in range(1, layout.depth if tolerance else 0):
         for name, values in level(producer, layout, layout.depth - up).items():
@@ -161,9 +160,7 @@ def test_voxels_are_right_in_trees_of_any_n(kind, branching):
 @pytest.mark.parametrize("kind", KINDS)
 def test_regions_hold_in_trees_of_any_n(kind, branching):
     """What `classify` states of a node is true of all finest voxels in it."""
-    producer = KINDS[kind][0](branching)
-    layout = layout_of(producer)
-    fine = level(producer, layout, layout.depth)
+    producer, layout, fine = finest(kind, branching)
     for depth in range(layout.depth + 1):
         loc = places(layout, depth)
         regions = wait_for(producer.classify(gv.Nodes(loc, layout)))

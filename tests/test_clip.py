@@ -135,30 +135,42 @@ def test_a_medium_of_one_value_has_its_closed_form(backend, name, lod):
     assert both.sum() > 20
 
 
+@pytest.fixture(scope="module")
+def marks_of_trees(blobs):
+    """A tree, and by backend and clip the marks in it, and in one with holes, of a haze."""
+    thin = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
+    tree = gv.N3Tree.from_volume(blobs, 2)
+    poor = with_holes(tree, 0.4, 7)
+
+    @functools.cache
+    def marks(backend: str, clip: gv.Clip | None = None) -> list[dict[str, torch.Tensor]]:
+        rays = camera_rays(tree, 12 if backend == "reference" else 60, distance=1.1)
+        options = {"lod": "finest"} | ({"clip": clip} if clip else {})
+        return [trace(seen, backend, rays, thin, **options)[1] for seen in (tree, poor)]
+
+    return tree, marks
+
+
 @pytest.mark.parametrize("name", CLIPS)
-def test_nothing_that_is_clipped_is_sampled_or_asked_for(blobs, backend, name):
+def test_nothing_that_is_clipped_is_sampled_or_asked_for(marks_of_trees, backend, name):
     """Checked by the stamps of bricks and tiles, and by the nodes that have a request."""
     clip = dataclasses.replace(CLIPS[name], caps=True)
-    tree = gv.N3Tree.from_volume(blobs, 2)
-    thin = gv.TransferFunction.from_points([(0, 0.001), (1, 0.002)])
-    rays = camera_rays(tree, 12 if backend == "reference" else 60, distance=1.1)
+    tree, marks_of = marks_of_trees
     gone = wholly_clipped(tree, clip)
     assert len(gone) > 50, "the test must clip something"
-    _, whole = trace(tree, backend, rays, thin, lod="finest")
-    _, marks = trace(tree, backend, rays, thin, lod="finest", clip=clip)
+    (whole, poor_whole), (marks, poor) = marks_of(backend), marks_of(backend, clip)
+    brick, parent = tree.nodes.brick_tn.flatten().tolist(), tree.nodes.parent_t.tolist()
     for used, sees_gone in ((whole, True), (marks, False)):
-        owner = tree.nodes.brick_tn.flatten()
-        bricks = {n for n in gone if owner[n] >= 0 and used["brick"][owner[n]] == 1}
-        parent = tree.nodes.parent_t
-        tiles = {t for t in range(len(parent)) if int(parent[t]) in gone and used["tile"][t] == 1}
+        stamps, stamp_of_tile = used["brick"].tolist(), used["tile"].tolist()
+        bricks = {n for n in gone if brick[n] >= 0 and stamps[brick[n]] == 1}
+        tiles = {t for t, n in enumerate(parent) if n in gone and stamp_of_tile[t] == 1}
         assert bool(bricks) == sees_gone and bool(tiles) == sees_gone
     assert (marks["brick"] == 1).sum() > 10
-    poor = with_holes(tree, 0.4, 7)
-    _, marks = trace(poor, backend, rays, thin, lod="finest", clip=clip)
-    requested = set(marks["request"].flatten().nonzero()[:, 0].tolist())
+    requested, of_whole = (
+        set(each["request"].flatten().nonzero()[:, 0].tolist()) for each in (poor, poor_whole)
+    )
     assert requested and not requested & gone
-    _, marks = trace(poor, backend, rays, thin, lod="finest")
-    assert set(marks["request"].flatten().nonzero()[:, 0].tolist()) & gone
+    assert of_whole & gone
 
 
 def wholly_clipped(tree: gv.N3Tree, clip: gv.Clip) -> set[int]:

@@ -245,7 +245,7 @@ def test_scouts_take_nothing_that_is_in_use(blobs, compiled, loading):
         placement = {"device": DEVICES[compiled], "loading": loading}
         with Watched(gv.VolumeProducer(blobs), **options, **budgets, **placement) as engine:
             azimuth, distance = 0.0, 1.0
-            for _ in range(60):
+            for _ in range(48):
                 azimuth += pick.gauss(0, 20)
                 distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.2))))
                 view = camera(12, azimuth=azimuth % 360 - 180, distance=distance)
@@ -355,19 +355,19 @@ def test_pools_are_honoured_to_the_byte():
 
 @pytest.mark.backend("cpp")
 def test_a_wandering_camera_leaves_memory_flat(blobs):
-    """After 2,000 frames nothing has piled up, and the pools are valid."""
+    """After 1,000 frames nothing has piled up, and the pools are valid."""
     pick = random.Random(7)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     options = {"brick_size": 4, "brick_pool": 60 * 6**3 * 4, "node_pool": 40 * 8 * 20}
     azimuth, distance, live, pages, evicted = 0.0, 1.0, [], [], 0
     with gv.Engine(gv.VolumeProducer(blobs), **options) as engine:
-        for number in range(2_000):
-            azimuth += pick.gauss(0, 6)
-            distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.05))))
+        for number in range(1_000):
+            azimuth += pick.gauss(0, 12)
+            distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.1))))
             view = camera(4, azimuth=azimuth % 360 - 180, distance=distance)
             _, stats = engine.frame(view, shader)
             evicted += stats.evicted["bricks"]
-            if number % 500 == 499:
+            if number % 250 == 249:
                 engine.validate()
                 gc.collect()
                 live.append(sum(isinstance(item, torch.Tensor) for item in gc.get_objects()))

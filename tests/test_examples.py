@@ -14,6 +14,7 @@ SHORT = {
     "galaxy": ["--stars", "20000"],
     "labels": ["--side", "64"],
     "mandelbulb_film": ["--frames", "4"],
+    "surface": ["--size", "48"],  # it has a level 3
 }
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
@@ -36,7 +37,7 @@ def test_example_writes_a_picture(example, tmp_path, monkeypatch, capsys, quick)
     monkeypatch.setenv("CXX", quick)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(example.parent))  # as when a script is run
-    arguments = ["--size", "48", "--output", str(out), *SHORT.get(example.stem, ())]
+    arguments = ["--size", "24", "--output", str(out), *SHORT.get(example.stem, ())]
     monkeypatch.setattr(sys, "argv", [str(example), *arguments])
     runpy.run_path(str(example), run_name="__main__")
     assert out.read_bytes().startswith(b"\x89PNG") and str(out) in capsys.readouterr().out

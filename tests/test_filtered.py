@@ -152,14 +152,14 @@ def test_a_solid_ball_covers_a_disc_from_afar(direction, growths):
         assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
 
 
-@pytest.mark.parametrize("directions", [True, False])
-def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, directions):
+@pytest.mark.parametrize(("directions", "counts"), [(True, [40]), (False, [1, 300])])
+def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, directions, counts):
     def colors() -> torch.Tensor:
         tree, shader = filtered(SHADER, directions=directions)
         return tree.bricks.bricks[shader.other]
 
     whole = colors()
-    for voxels in (1, 40, 300):
+    for voxels in counts:
         monkeypatch.setitem(coarse_colors._TILE_VOXELS, "cpu", voxels)
         torch.testing.assert_close(colors(), whole, rtol=0, atol=1e-3)
     assert whole.unique().numel() > 1000, "the test must see something"
@@ -243,34 +243,42 @@ def resident(directions: bool, device: str) -> tuple[gv.N3Tree, gv.Filtered]:
     return tree, gv.Filtered.of(tree, matter(), SHADER, directions=directions)
 
 
-@pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
-@pytest.mark.parametrize("directions", [True, False])
-def test_streamed_equals_resident(compiled, directions, hold):
+@pytest.mark.parametrize(
+    ("hold", "directions", "size", "share"),  # each pair of values
+    [
+        ("voxels", True, 4_000_000, 0.5),
+        ("voxels", False, 150_000, 0.25),
+        ("bricks", True, 150_000, 0.25),
+        ("bricks", False, 4_000_000, 0.5),
+        ("mapped", True, 4_000_000, 0.5),
+        ("mapped", False, 150_000, 0.25),
+    ],
+)
+def test_streamed_equals_resident(compiled, hold, directions, size, share):
     """In pools that hold all bricks, and in pools that hold a part."""
     device = "cuda" if compiled == "cuda" else "cpu"
     volume, (tree, whole) = matter(), resident(directions, device)
-    for size, share in ((4_000_000, 0.5), (150_000, 0.25)):
-        shader = gv.Filtered(SHADER, directions=directions)
-        producer = gv.VolumeProducer(volume, hold=hold, filtered=shader)
-        pools = {"brick_size": 4, "brick_pool": size, "coarse_share": share, "device": device}
-        with gv.Engine(producer, **pools) as engine:
-            bricks, crowded = engine.cache.bricks, False
-            assert size - 12_000 < engine.memory()["brick_pool"] <= size
-            assert bricks.coarse == pytest.approx(share * bricks.capacity, rel=0.3)
-            for distance in (1.5, 4.0, 10.0, 0.7):
-                camera = gv.Camera.orbit(width=40, height=30, distance=distance)
-                actual = engine.render(camera, shader)
-                expected = gv.render(tree, camera, whole)
-                assert actual.stats.converged
-                crowded |= actual.stats.capacity_exceeded
-                for field in ("color", "alpha", "depth"):
-                    assert torch.equal(getattr(actual, field), getattr(expected, field)), field
-                engine.validate()
-                depth = engine.trees["scene"].tree.loc(bricks.owner_b.clamp(min=0).long())[:, 3]
-                coarse = depth[: bricks.coarse][bricks.owner_b[: bricks.coarse] >= 0]
-                fine = depth[bricks.coarse :][bricks.owner_b[bricks.coarse :] >= 0]
-                assert (coarse < tree.depth).all() and (fine == tree.depth).all()
-            assert crowded == (size < 4_000_000)
+    shader = gv.Filtered(SHADER, directions=directions)
+    producer = gv.VolumeProducer(volume, hold=hold, filtered=shader)
+    pools = {"brick_size": 4, "brick_pool": size, "coarse_share": share, "device": device}
+    with gv.Engine(producer, **pools) as engine:
+        bricks, crowded = engine.cache.bricks, False
+        assert size - 12_000 < engine.memory()["brick_pool"] <= size
+        assert bricks.coarse == pytest.approx(share * bricks.capacity, rel=0.3)
+        for distance in (1.5, 4.0, 10.0, 0.7):
+            camera = gv.Camera.orbit(width=40, height=30, distance=distance)
+            actual = engine.render(camera, shader)
+            expected = gv.render(tree, camera, whole)
+            assert actual.stats.converged
+            crowded |= actual.stats.capacity_exceeded
+            for field in ("color", "alpha", "depth"):
+                assert torch.equal(getattr(actual, field), getattr(expected, field)), field
+            engine.validate()
+            depth = engine.trees["scene"].tree.loc(bricks.owner_b.clamp(min=0).long())[:, 3]
+            coarse = depth[: bricks.coarse][bricks.owner_b[: bricks.coarse] >= 0]
+            fine = depth[bricks.coarse :][bricks.owner_b[bricks.coarse :] >= 0]
+            assert (coarse < tree.depth).all() and (fine == tree.depth).all()
+        assert crowded == (size < 4_000_000)
 
 
 @pytest.mark.backend("cpp")

@@ -188,12 +188,12 @@ def digest(parts: Iterable[Any], hashed: str) -> str:
     """Returns 16 hex digits of the bytes and shapes of what was returned."""
     total = hashlib.sha256()
     for part in parts:
-        content = str(part).encode()
         if isinstance(part, Tensor):
             rounded = hashed == "float32" and part.dtype == torch.float64
             array = (part.to(torch.float32) if rounded else part).cpu().contiguous().numpy()
-            content = str(array.shape).encode() + array.tobytes()
-        total.update(content)
+            total.update(str(array.shape).encode() + array.tobytes())
+        else:
+            total.update(str(part).encode())
     return total.hexdigest()[:16]
 
 

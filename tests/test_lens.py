@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -73,16 +74,21 @@ def similarity(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(ssim(*planes, window_size=11).mean())
 
 
+@functools.cache
 def grains(side: int = 96, count: int = 150) -> gv.Volume:
     """Returns small balls all over the box."""
     generator = np.random.default_rng(1)
-    z, y, x = np.mgrid[0:side, 0:side, 0:side].astype(np.float32) / side * 2 - 1
-    value = np.zeros_like(x)
+    grid = np.mgrid[0:side, 0:side, 0:side].astype(np.float32) / side * 2 - 1
+    value = np.zeros((side,) * 3, np.float32)
     for _ in range(count):
-        (cx, cy, cz), r = generator.uniform(-0.9, 0.9, 3), generator.uniform(0.05, 0.13)
+        center, r = generator.uniform(-0.9, 0.9, 3), generator.uniform(0.05, 0.13)
+        ends = [((center[::-1] + way * r + 1) / 2 * side).astype(int) for way in (-1, 1)]
+        box = tuple(slice(max(low, 0), high + 2) for low, high in zip(*ends, strict=True))
+        z, y, x = grid[:, *box]
+        cx, cy, cz = center
         distance = np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2)
         ball = np.clip((r - distance) / 0.03, 0, 1) * generator.uniform(0.3, 1)
-        value = np.maximum(value, ball)
+        value[box] = np.maximum(value[box], ball)
     return gv.Volume(torch.from_numpy((255 * value).astype(np.uint8)))
 
 

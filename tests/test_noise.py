@@ -136,11 +136,11 @@ def test_bounds_hold_at_a_million_points(name, n):
 
 @named
 @both
-def test_slopes_hold_at_a_million_points(name, n):
+def test_slopes_hold_at_400_000_points(name, n):
     slope, random = noise.bounds(ALL[name], n).slope, torch.Generator().manual_seed(3)
     steepest = 0.0
     for seed in range(10):
-        points = random_points(100_000, n)
+        points = random_points(40_000, n)
         step = torch.randn(points.shape, generator=random, dtype=torch.float64)
         step *= 1e-5 / step.norm(dim=1, keepdim=True)
         ends = (ALL[name](p, seed=seed) for p in (points - step, points + step))
@@ -155,7 +155,7 @@ def test_bounds_of_gradient_noise_are_met_by_the_best_gradients(n, height, slope
     """At the points where a search found the largest sums over corners with the best gradients."""
     half = torch.full((n,), 0.5, dtype=torch.float64)
     top = torch.tensor([0.48149221, 0.64474330, 0.5], dtype=torch.float64) if n == 3 else half
-    edges = torch.tensor([numpy_noise.edge(word << 6) for word in range(2**26) if not word % 99991])
+    edges = torch.tensor([numpy_noise.edge(word << 6) for word in range(0, 2**26, 99991)])
     edges = edges.unique(dim=0)[:, :n].to(torch.float64)
     u = torch.eye(n, dtype=torch.float64)[0]
     high = steep = 0.0

@@ -205,8 +205,8 @@ def test_no_brick_is_dropped(name):
 
 @pytest.mark.parametrize("octaves", [1, 4])
 def test_noise_passes_no_proof_in_random_boxes(octaves):
-    """10^5 nodes of all levels, two thirds of them near the limit at which they are proven EMPTY or
-    CONSTANT: 32 values of each by the formula.
+    """`BOXES` nodes of all levels, two thirds of them near the limit at which they are proven EMPTY
+    or CONSTANT: 32 values of each by the formula.
     """
     rough = {**ROUGH, "frequency": 60.0, "octaves": octaves, "dtype": torch.float32}
     producer, random = gv.Hypertexture(ball(), 2**12, **rough), torch.Generator().manual_seed(9)
@@ -236,7 +236,7 @@ NOT_FIELDS = {*ALL, "mesh", "distances to a mesh", "points"}
 
 @pytest.mark.parametrize("name", [name for name in PRODUCERS if name not in NOT_FIELDS])
 def test_intervals_of_fields_hold_in_random_boxes(name):
-    """10^5 boxes, 12 values of each; for prefiltered fields, with voxels of any size."""
+    """`BOXES` boxes, 12 values of each; for prefiltered fields, with voxels of any size."""
     producer = PRODUCERS[name]()
     center, half = random_boxes(BOXES)
     random = torch.Generator().manual_seed(8)

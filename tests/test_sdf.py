@@ -118,7 +118,7 @@ def test_intervals_of_repeated_shapes_hold_where_cells_change(make, by):
 
 
 def test_intervals_hold_in_random_boxes(shape):
-    """10^5 boxes: no value at 27 points of each is outside, and no slope is exceeded."""
+    """`BOXES` boxes: no value at 27 points of each is outside, and no slope is exceeded."""
     center, half = random_boxes(BOXES)
     low, high = shape.bounds(center, half)
     steep = shape.slope(center, half)

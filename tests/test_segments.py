@@ -73,10 +73,9 @@ def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False
 
 @pytest.mark.parametrize(
     ("brick_size", "branching", "lod", "hides"),
-    [  # any two of the options meet in every way, and any three
-        *((2, 2, "auto", True), (2, 2, "finest", False), (2, 3, "auto", False)),
-        *((2, 3, "finest", True), (8, 2, "auto", False), (8, 2, "finest", True)),
-        *((8, 3, "auto", True), (8, 3, "finest", False)),
+    [  # any two of the options meet in every way
+        *((2, 2, "auto", True), (2, 3, "finest", False), (8, 2, "finest", False)),
+        *((8, 3, "auto", False), (8, 3, "finest", True)),
     ],
 )
 def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod, hides):

@@ -65,9 +65,10 @@ def with_and_without_ranges(channels) -> dict[float | None, tuple[gv.N3Tree, gv.
 @pytest.mark.parametrize("name", SHADERS)
 def test_compiled_equals_reference(tree, compiled, name, lod):
     few = "shadows" in name or lod == "finest"  # the twin is slow
+    step = 2.3 if "shadows" in name and lod == "finest" else 1.0  # a cone from each sample
     for distance in (1.3,) if few else (0.2, 1.3, 6.0):
         rays = camera_rays(tree, 6 if few else 10, distance=distance)
-        expected, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], lod=lod)
+        expected, _, actual = assert_equal(tree, compiled, rays, SHADERS[name], lod=lod, step=step)
         if compiled == "cpp":
             for field in ("color", "alpha", "depth", "normal", "features"):
                 assert torch.equal(actual[field], expected[field]), field
@@ -315,6 +316,7 @@ def assert_all_same(actual, expected):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", SHADERS)
 def test_script_compile_and_export(tree, compiled, name):
+    """Every other one is compiled: that takes longest, and traces the code that export traces."""
     torch._dynamo.reset()  # each tracer is a module of its own
     tracer, rays = module(tree, name, compiled)
     plain = tracer(*rays)
@@ -325,20 +327,26 @@ def test_script_compile_and_export(tree, compiled, name):
     torch.jit.save(torch.jit.script(tracer), file)
     file.seek(0)
     assert_all_same(torch.jit.load(file).hits(*rays), expected)
-    fast = torch.compile(tracer.hits, fullgraph=True, backend="aot_eager")
-    assert_all_same(fast(*rays), expected)
+    if [*SHADERS].index(name) % 2 == 0:
+        fast = torch.compile(tracer.hits, fullgraph=True, backend="aot_eager")
+        assert_all_same(fast(*rays), expected)
     program = torch.export.export(tracer, rays).module()
     assert all(torch.equal(a, b) for a, b in zip(program(*rays), plain, strict=True))
 
 
 @pytest.mark.parametrize("name", SHADERS)
 def test_opcheck(tree, compiled, name):
-    """In one dtype per shader, alternating; test_op_contract.py checks the other op in both."""
-    tree = copy_to(tree, DEVICES[compiled])
-    dtype = (torch.float32, torch.float64)[[*SHADERS].index(name) % 2]
+    """In one dtype per shader, alternating; test_op_contract.py checks the other op in both. What
+    does not depend on what the kernel returns, autograd and graphs, is checked once a dtype.
+    """
+    tree, number = copy_to(tree, DEVICES[compiled]), [*SHADERS].index(name)
+    dtype, checks = (torch.float32, torch.float64)[number % 2], ["test_schema", "test_faketensor"]
+    if number < 2:
+        checks += ["test_autograd_registration", "test_aot_dispatch_dynamic"]
     rays, traced, shading, parameters = op_arguments(tree, SHADERS[name], dtype)
     op = torch.ops.gvtorch.shade_rays.default
-    torch.library.opcheck(op, (*rays, *traced, *shading, parameters))
+    arguments = (*rays, *traced, *shading, parameters)
+    assert set(torch.library.opcheck(op, arguments, test_utils=checks).values()) == {"SUCCESS"}
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,14 @@ from gvtorch.ops.reference import exact
 from gvtorch.tracing.tracer import Tracer
 
 
-@pytest.mark.parametrize("lod", ["finest", "auto"])
-@pytest.mark.parametrize("branching", [2, 3, 4])
-@pytest.mark.parametrize("brick_size", [2, 4, 8])
+@pytest.mark.parametrize(
+    ("brick_size", "branching", "lod"),  # each pair of values
+    [
+        *((2, 2, "auto"), (2, 3, "finest"), (2, 4, "auto")),
+        *((4, 2, "finest"), (4, 3, "auto"), (4, 4, "finest")),
+        *((8, 2, "auto"), (8, 3, "finest"), (8, 4, "auto")),
+    ],
+)
 def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod):
     tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
     for distance in (0.2, 1.3, 6.0):
@@ -35,9 +40,14 @@ def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod):
     assert not marks["request"].any(), "a resident tree misses nothing"
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("border", [0, 1, 2])
-@pytest.mark.parametrize("step", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize(
+    ("step", "border", "dtype"),  # each pair of values
+    [
+        *((0.3, 0, torch.float32), (0.3, 1, torch.float64), (0.3, 2, torch.float32)),
+        *((1.0, 0, torch.float64), (1.0, 1, torch.float32), (1.0, 2, torch.float64)),
+        *((3.0, 0, torch.float32), (3.0, 1, torch.float64), (3.0, 2, torch.float32)),
+    ],
+)
 def test_compiled_equals_reference_for_steps_borders_and_dtypes(
     blobs, compiled, border, step, dtype
 ):

@@ -118,7 +118,7 @@ def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
         (holes, 14, {}),
     ]
     if getattr(shader, "shadows", False):  # the twin traces a cone from each sample, step by step
-        pictures = [(tree, 21, {"step": 1.7}), (holes, 14, {"lod": "finest", "step": 3.0})]
+        pictures = [(tree, 21, {"step": 2.6}), (holes, 14, {"lod": "finest", "step": 3.9})]
     for traced_tree, size, options in pictures:
         rays = camera_rays(traced_tree, size, distance=1.5)
         cut = cut_rays(rays)

@@ -232,7 +232,7 @@ def random_points(count, side=4.0, seed=0):
 
 
 #: Number of boxes in which bounds are tested.
-BOXES = 100_000
+BOXES = 50_000
 
 
 def random_boxes(count, seed=1):
