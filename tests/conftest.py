@@ -131,10 +131,10 @@ def distributed_tensors() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def characters(cache: Path) -> None:
+def characters(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Hypothesis lists all characters and keeps the list on disk: one process makes it for all."""
     if "PYTEST_XDIST_WORKER" in os.environ:
-        with cache.with_name("characters.lock").open("w") as lock:
+        with tmp_path_factory.getbasetemp().with_name("characters.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             strategies.characters(codec="utf-8").validate()
 

@@ -12,8 +12,9 @@ namespace gvtorch::GV_NAMESPACE {
 
 constexpr int32_t kMaxNumbers = 16;  // of a voxel that `numbers_at` reads at once
 
-// How read_number and read_brick convert voxels. By an instruction for halves they would need fewer registers, and nvcc
-// would leave fewer for the loads of all dtypes: shadows on a GPU would take a tenth longer.
+// How read_number and read_brick convert voxels, and read_four where rays have shadows. By an instruction for halves
+// they would need fewer registers, and nvcc would leave fewer for the loads of all dtypes: shadows on a GPU would take
+// a tenth longer.
 template <class Voxel>
 using Converted = std::conditional_t<std::is_same_v<Voxel, Half>, PlainHalf, Voxel>;
 
@@ -52,14 +53,15 @@ GV_CALL T read_brick(const void* voxels, VoxelType type, int32_t width, int64_t 
 }
 
 // Interpolates four consecutive numbers of the voxels.
-template <class T>
+template <class T, bool kShadows>
 GV_CALL Row<T> read_four(const void* voxels, VoxelType type, int32_t width, int64_t first, int32_t side, T x, T y,
                          T z) {
   Row<T> row{};
   with_voxel(type, [&](auto voxel) {
+    using Voxel = std::conditional_t<kShadows, Converted<decltype(voxel)>, decltype(voxel)>;
     const EightVoxels<T> corners({x, y, z}, side);
     const int32_t step_y = width * side, step_z = step_y * side;
-    const auto* corner = static_cast<const decltype(voxel)*>(voxels) + first +
+    const auto* corner = static_cast<const Voxel*>(voxels) + first +
                          (corners.cell[2] * step_z + corners.cell[1] * step_y + corners.cell[0] * width);
     const auto blend = [&](int32_t i) {
       return corners.blend([&](int y, int z, T& left, T& right) {
@@ -220,9 +222,10 @@ struct Probe {
   }
 
   // Four consecutive numbers of a channel at distance t; the voxels around it are found once.
+  template <bool kShadows = false>
   GV_HD Row<T> four_at(bool, const ChannelView& channel, int32_t first, T t) const {
-    const Row<T> row = four_in(channel, first, fine, t);
-    return mixed ? between(row, four_in(channel, first, coarse, t), t) : row;
+    const Row<T> row = four_in<kShadows>(channel, first, fine, t);
+    return mixed ? between(row, four_in<kShadows>(channel, first, coarse, t), t) : row;
   }
 
   // Several numbers of a channel at distance t, at most kMaxNumbers.
@@ -263,10 +266,12 @@ struct Probe {
     }
     return slope;
   }
+  template <bool kShadows = false>
   GV_HD Row<T> four_of(bool, const ChannelView& channel, int32_t component, const Spot<T>& spot, T t) const {
     const int64_t first = first_of(channel, component, spot);
     const Vec3<T> at = spot.at(t);
-    return read_four(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at.x, at.y, at.z);
+    return read_four<T, kShadows>(channel.bricks_bzyxc, channel.type, channel.width, first, channels.side, at.x, at.y,
+                                  at.z);
   }
   GV_HD static T scale_of(const Spot<T>& spot) { return spot.scale; }
   // The value of one voxel of a brick; x, y and z count the border.
@@ -307,8 +312,9 @@ struct Probe {
   }
 
  private:
+  template <bool kShadows>
   GV_HD Row<T> four_in(const ChannelView& channel, int32_t first, const Spot<T>& spot, T t) const {
-    if (spot.brick >= 0) return four_of(true, channel, first, spot, t);
+    if (spot.brick >= 0) return four_of<kShadows>(true, channel, first, spot, t);
     const auto read = [&](int32_t i) { return channel.constant<T>(spot.node, first + i); };
     return {read(0), read(1), read(2), read(3)};
   }

@@ -51,7 +51,7 @@ class Shadows {
   }
 
  private:
-  static constexpr int32_t kPoints = 8;
+  static constexpr int32_t kPoints = 4;
   struct Memory {  // of a warp; the last index is the ray's thread
     Ray<T> ray[kWarpThreads];
     Sight<T> sight[kWarpThreads];

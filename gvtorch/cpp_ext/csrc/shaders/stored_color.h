@@ -84,7 +84,9 @@ struct StoredColor : ShaderFacts {
       const auto stored = [&](MaskOf<V>) { return Row<V>{read(0), read(1), read(2), V{}}; };
       add_stored(mask, saturate(piece.value * numbers().scale), stored, piece, probe, sum, shadow...);
     } else {
-      const auto read = [&](bool, int32_t first) { return probe.four_at(true, channel, first, t); };
+      const auto read = [&](bool, int32_t first) {
+        return probe.template four_at<sizeof...(Shadow) != 0>(true, channel, first, t);
+      };
       const auto stored = [&](bool) { return channel.width == 4 ? read(true, 0) : of_sides<V>(true, probe, read); };
       add_stored(mask, opacity_of(mask, piece, probe), stored, piece, probe, sum, shadow...);
     }
