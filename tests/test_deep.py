@@ -306,7 +306,7 @@ def test_which_trees_are_deep():
 def test_a_tree_deeper_than_float64_counts_is_refused(blobs):
     tree = gv.N3Tree.from_volume(blobs, 4)
     ray_args, traced = arguments(tree, 2)
-    with pytest.raises(ValueError, match=r"branching 2 and max_depth 51 make more than 2\^50"):
+    with pytest.raises(ValueError, match=r"branching 2, max_depth 51: over 2\^50"):
         trace_rays(ray_args, traced._replace(max_depth=51))
 
 

@@ -31,10 +31,9 @@ def test_the_bookkeeping_is_what_was_counted(blobs, channels, branching, monkeyp
         gv.Engine(producer, brick_pool="4 MB", node_pool="1 MB")
     monkeypatch.undo()
 
-    def count(producers, tiles, node_bytes, bricks, brick_bytes, branching, device):
-        rest = tiles * (setup._TILE_BYTES + 2 * branching**3) + bricks * setup._BRICK_BYTES
-        counted.append({"node_pool": node_bytes, "brick_pool": brick_bytes, "bookkeeping": rest})
-        original(producers, tiles, node_bytes, bricks, brick_bytes, branching, device)
+    def count(parts, cache_nbytes, device):
+        counted.append({name.removeprefix("their "): size for name, size in parts.items()})
+        original(parts, cache_nbytes, device)
 
     monkeypatch.setattr(setup, "_check_memory", count)
     with gv.Engine(producer, brick_pool="4 MB", node_pool="1 MB") as engine:

@@ -382,7 +382,7 @@ def test_bad_files_are_told_in_a_line(tmp_path, name, content, message):
     [
         (lambda: gv.read_mesh(3), "read_mesh: path must be a str or PathLike"),
         (lambda: gv.read_mesh("a.obj", texture=3), "read_mesh: texture must be a str or PathLike"),
-        (lambda: gv.voxelize(3, "a"), "voxelize: mesh must be a Mesh or str or PathLike"),
+        (lambda: gv.voxelize(3, "a"), "voxelize: mesh must be a Mesh, str or PathLike"),
         (lambda: gv.SampledDistance.of_mesh(3), "SampledDistance: mesh must be a Mesh"),
     ],
 )

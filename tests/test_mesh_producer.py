@@ -233,5 +233,5 @@ def test_a_file_is_read(tmp_path):
 
 
 def test_what_is_no_mesh_is_told():
-    with pytest.raises(ValueError, match="MeshProducer: mesh must be a Mesh or str or Path, got i"):
+    with pytest.raises(ValueError, match="MeshProducer: mesh must be a Mesh, str or Path, got i"):
         gv.MeshProducer(3)

@@ -280,7 +280,9 @@ class Engine(FrameSteps):
         """
         shaders = shader.values() if isinstance(shader, Mapping) else (shader,)
         if any(isinstance(each, Shader) and each.uses_torch for each in shaders):
-            raise ValueError("Engine.capture: a ModuleShader can't be recorded: the host waits")
+            raise ValueError(
+                "Engine.capture: a ModuleShader can't be recorded: the host waits for its results"
+            )
         if self.device.type != "cuda":
             raise ValueError(f"Engine.capture: the engine must be on CUDA, it is on {self.device}")
         view = self.view("capture", camera, shader, options)

@@ -46,7 +46,7 @@ def check_channel(context: str, arguments: TraceArguments, device: torch.device)
     sizes = check.tensors(context, device, placement + fields)
     depth = check.integer(context, "max_depth", arguments.max_depth, low=0, high=62)
     if n**depth > config.MOST_NODES:
-        raise ValueError(f"{context}: over 2^50 nodes a side: branching {n}, max_depth {depth}")
+        raise ValueError(f"{context}: branching {n}, max_depth {depth}: over 2^50 nodes a side")
     check.integer(context, "border", arguments.border, low=0, high=(sizes["s"] - 1) // 2)
     check.number(context, "root_voxel", arguments.root_voxel, low=0, open_low=True)
     check.number(context, "step", arguments.step, low=0, open_low=True)

@@ -105,6 +105,8 @@ def _unpack_tile(page: Any, keyframe: Any, tile_number: int) -> np.ndarray | Non
 def open_tiff(path: str, key: str | None = None) -> VolumeSource:
     """Opens a stack: the series `key` (its number or name) of a file, the first if left out."""
     with opened_tiff(path) as (file, log):
+        if not file.series:
+            raise ValueError("it holds no images")
         chosen, others = choose(path, "series", [item.name for item in file.series], key)
         series = file.series[chosen]
         shape = tuple(int(n) for n in series.shape)
