@@ -16,6 +16,7 @@ from gvtorch.shaders.shader import Sampling
 
 BALL = sdf.Sphere()
 TALL = ((-1, -1, -1), (1, 1, 3))
+BOX = torch.tensor(TALL)
 POINTS = [[0.0, 0, 0], [1, 1, 2]]
 PLACES, WHOLE = torch.rand(4, 3), torch.zeros(4, 3, dtype=torch.int64)
 VOLUME = gv.Volume(torch.rand(8, 8, 8, 2))
@@ -108,6 +109,25 @@ def test_integers_of_numpy_are_extents():
         (lambda: gv.Environment(PICTURE, rotation="up"), "rotation must be numbers, got 'up'"),
         (lambda: gv.Environment(PICTURE, rotation=torch.eye(3) * 1j), "must be real numbers, got"),
         (lambda: gv.Overlay("wide", 64), "Overlay: width must be an int >= 1, got 'wide'"),
+        (lambda: gv.Overlay(64, 64, text=5), "Overlay: text must be a str, got int"),
+        (lambda: gv.Overlay(64, 64, bar=GRAY), "Overlay: bar must be a ColorBar, got Trans"),
+        (lambda: gv.Overlay(64, 64, pixel=1, unit=5), "Overlay: unit must be a str, got int"),
+        (lambda: gv.ColorBar(colors=5, low=0, high=1), "ColorBar: colors must be callable, got 5"),
+        (lambda: gv.TransferModule(5, 1.0), "shader must be a TransferFunction, got int"),
+        (lambda: gv.TransferModule(GRAY, -1), "TransferModule: spacing must be"),
+        (lambda: gv.Camera.orbit().placed(5), "Camera.placed: box must be a Tensor, got int"),
+        (lambda: gv.Camera.from_kornia(5), "from_kornia: takes a PinholeCamera, got 5"),
+        (lambda: gv.Camera.from_viewmat_K("a", 5, 4, 4), "viewmats must be numbers, got 'a'"),
+        (
+            lambda: gv.CustomCamera.from_directions(PICTURE, 5),
+            "direction must be a Tensor, got int",
+        ),
+        (lambda: gv.CustomCamera.from_directions(5, PICTURE), "origin must be a Tensor, got int"),
+        (lambda: gv.CameraPath.orbit(5), "CameraPath.orbit: box must be (2, 3) numbers"),
+        (lambda: gv.CameraPath.orbit(BOX, azimuth="x"), "azimuth must be a number, got 'x'"),
+        (lambda: gv.CameraPath.orbit(BOX, fit_size=5), "fit_size must be a list, got 5"),
+        (lambda: gv.read_cameras(5), "read_cameras: path must be a str or PathLike, got int"),
+        (lambda: gv.splat(POINTS, 5), "splat: store must be a str or PathLike, got int"),
         (lambda: gv.Filtered.of("tree", VOLUME, GRAY), "Filtered: tree must be a N3Tree, got str"),
         (lambda: gv.Channels(3), "Channels: looks must be a list, got 3"),
         (lambda: gv.Channels.of(VOLUME, components=5), "components must be a list, got 5"),

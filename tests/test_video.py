@@ -69,6 +69,13 @@ def test_a_film_that_is_written_again_begins_anew(tmp_path, suffix):
             assert film.n_frames == count
 
 
+def test_what_is_no_picture_is_told(tmp_path):
+    with gv.Video(tmp_path / "a.gif", WIDTH, HEIGHT) as video:
+        video.add(picture(0))
+        with pytest.raises(ValueError, match="Video: picture must be a Picture, got int"):
+            video.add(5)
+
+
 def test_mp4(tmp_path):
     av = pytest.importorskip("av")
     expected = written(tmp_path / "a.mp4", 12)

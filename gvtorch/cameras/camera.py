@@ -255,14 +255,20 @@ class Camera:
         the camera model by its name there, and (..., 4) coefficients of a fisheye. Leading
         dimensions are flattened to one batch.
         """
-        view, K = (m.flatten(0, -3) if m.dim() > 3 else m for m in (viewmats, Ks))
-        if radial_coeffs is not None and radial_coeffs.dim() > 2:
+        matrices = {"viewmats": viewmats, "Ks": Ks}
+        given = (check.reals("Camera.from_viewmat_K", *item) for item in matrices.items())
+        view, K = (m.flatten(0, -3) if m.dim() > 3 else m for m in given)
+        if isinstance(radial_coeffs, Tensor) and radial_coeffs.dim() > 2:
             radial_coeffs = radial_coeffs.flatten(0, -2)
         return Camera(view, K, width, height, model=camera_model, radial_coeffs=radial_coeffs)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:
         """Takes kornia's `PinholeCamera` (a batch), whose pixel centres are at integers."""
+        if not hasattr(camera, "extrinsics"):  # kornia takes a second to import
+            raise ValueError(
+                f"Camera.from_kornia: takes a PinholeCamera, got {check.as_text(camera)}"
+            )
         sizes = torch.stack((camera.height, camera.width)).long().unique(dim=1)
         if sizes.shape[1] != 1:
             raise ValueError("Camera.from_kornia: all cameras must have one height and width")
@@ -324,6 +330,7 @@ class Camera:
         """Returns the camera in world units, given the (2, 3) box of the scene."""
         if self.frame is Coordinates.WORLD:
             return self
+        check.instance("Camera.placed", "box", box, Tensor)
         # NumPy, here and in `numbers`: calls of torch take longer, and release the GIL, for which
         # the frame would queue again and again behind the threads that read a store.
         low, high = box.numpy()

@@ -98,6 +98,7 @@ class CustomCamera(Camera):
         Raises:
             ValueError: A shape is wrong, or (checked on the CPU only) a number NaN, a direction 0.
         """
+        instance("CustomCamera", "direction", direction, Tensor)
         if direction.dim() not in (3, 4) or direction.shape[-1] != 3 or not direction.numel():
             wanted = "(h, w, 3) or (n, h, w, 3)"
             raise ValueError(f"CustomCamera: direction must be {wanted}, got {describe(direction)}")
@@ -110,6 +111,7 @@ class CustomCamera(Camera):
             if part is None:
                 shaped[name] = _neighbour_cones(shaped["origin"], direction)
                 continue
+            instance("CustomCamera", name, part, Tensor)
             try:
                 shaped[name] = part.to(direction).expand(shape)
             except RuntimeError:

@@ -19,6 +19,7 @@ import json
 import math
 import xml.etree.ElementTree as xml
 from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,7 @@ def read_cameras(
         FileNotFoundError: There is no such file.
         ValueError: The path is none of these, or damaged, or no model supports a lens's distortion.
     """
+    check.instance("read_cameras", "path", path, str, PathLike)
     path = Path(path)
     if (width is None) != (height is None):
         raise ValueError("read_cameras: give both width and height, or neither")

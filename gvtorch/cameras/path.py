@@ -89,12 +89,15 @@ class CameraPath:
         """
         context = "CameraPath.orbit"
         fov = model_of(context, model).fov if fov is None else fov
+        box = check.reals(context, "box", box, (2, 3))
+        azimuth = check.number(context, "azimuth", azimuth)
         azimuths = azimuth + torch.linspace(0, 360, 37, dtype=torch.float32, device="cpu")
         if fit_size is not None:
             if distance is not None:
                 problem = f"fit_size finds the distance: leave it out, got {distance}"
                 raise ValueError(f"{context}: {problem}")
-            fitted = Camera.orbit(azimuths, elevation, None, fov, *fit_size, model, up=up, fit=True)
+            w, h = check.items(context, "fit_size", fit_size)
+            fitted = Camera.orbit(azimuths, elevation, None, fov, w, h, model, up=up, fit=True)
             farthest = (box.mean(0) - _eye_positions(fitted.placed(box))).norm(dim=1).amax()
             distance = float(farthest / (box[1] - box[0]).max())
         cameras = Camera.orbit(azimuths, elevation, distance, width=1, height=1, up=up).placed(box)

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -124,6 +125,7 @@ def splat(
     Raises:
         ValueError, OSError, KeyboardInterrupt: As in `read_points`, `sort_points` and `convert`.
     """
+    check.instance("splat", "store", store, str, PathLike)
     target = Path(store)
     check.one_of("splat", "channel", channel, CHANNELS)
     begun = is_begun(target, resume=resume)

@@ -45,6 +45,9 @@ class ColorBar:
     title: str = ""
 
     def __post_init__(self) -> None:
+        check.instance("ColorBar", "title", self.title, str)
+        if not callable(self.colors):
+            raise ValueError(f"ColorBar: colors must be callable, got {check.as_text(self.colors)}")
         low = check.number("ColorBar", "low", self.low)
         if check.number("ColorBar", "high", self.high) <= low:
             raise ValueError(f"ColorBar: high must be > low, got {low:g} and {self.high:g}")
@@ -90,6 +93,9 @@ class Overlay:
         self._size = (width, height)
         self._pen = _Pen(max(_MIN_LETTER_SIZE, round(min(width, height) / _LETTERS_PER_SIDE)))
         self._stamps: list[_Stamp] = []
+        for name, value, kind in (("text", text, str), ("unit", unit, str), ("bar", bar, ColorBar)):
+            if value is not None:
+                check.instance("Overlay", name, value, kind)
         if text:
             self._add_stamp(self._pen.text_lines(text), top=self._pen.size, left=self._pen.size)
         if pixel is not None:

@@ -67,7 +67,7 @@ class Video:
         """
         if self._stack is None:
             raise RuntimeError("Video: pictures can be added within its with block only")
-        pixels = picture.to_srgb8().numpy()
+        pixels = check.instance("Video", "picture", picture, Picture).to_srgb8().numpy()
         width, height = self._size
         if pixels.shape != (height, width, 3):
             raise ValueError(f"Video: picture must be ({height}, {width}, 3), got {pixels.shape}")

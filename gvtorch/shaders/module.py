@@ -125,6 +125,8 @@ class TransferModule(torch.nn.Module):
         reference length of opacity if the function has none.
         """
         super().__init__()
+        check.instance("TransferModule", "shader", shader, TransferFunction)
+        spacing = check.number("TransferModule", "spacing", spacing, low=0, open_low=True)
         self.reference = float(shader.reference or spacing)
         table = shader.table(Sampling(smallest_spacing=spacing, step=self.reference))
         self.low, high = table.domain_2.tolist()
