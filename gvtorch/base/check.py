@@ -243,7 +243,8 @@ def device(context: str, value: Any) -> torch.device:
     index = torch.cuda.current_device() if parsed.index is None else parsed.index
     count = torch.cuda.device_count()
     if index >= count:
-        raise ValueError(f"{context}: device {parsed} can't be used here: torch sees {count}")
+        seen = f"torch sees {count} of them"
+        raise ValueError(f"{context}: device {parsed} can't be used here: {seen}")
     return torch.device("cuda", index)
 
 

@@ -199,9 +199,8 @@ class Cache:
         sizes = (nodes.capacity, bricks.capacity)
         for group, capacity in zip(self.lru.values(), sizes, strict=True):
             order = torch.cat([lru.order for lru in group]).sort().values
-            if not torch.equal(
-                order, torch.arange(capacity - len(order), capacity, device=order.device).to(order)
-            ):
+            slots = torch.arange(capacity - len(order), capacity, device=order.device)
+            if not torch.equal(order, slots.to(order)):
                 raise ValueError("Cache: the order of use is no permutation of the slots")
         linked = (nodes.parent_t >= 0) | nodes.shared_t
         linked[: len(self.finest)] = True  # the roots

@@ -332,9 +332,8 @@ class HostFrame(RecordedFrame):
     def _leave_to_host(self, batch: RequestBatch) -> None:
         """Lets nodes be requested again, for `Engine.frame`, which can find alias targets."""
         self.host_needed = True
-        bit = torch.full(
-            (len(batch),), batch.kind << REQUEST_PENDING_SHIFT, dtype=torch.int32, device="cpu"
-        )
+        pending = batch.kind << REQUEST_PENDING_SHIFT
+        bit = torch.full((len(batch),), pending, dtype=torch.int32, device="cpu")
         self._queue(batch, "to_host", {"node": batch.targets.node, "bit": bit}, {})
 
     def _queue(

@@ -389,11 +389,8 @@ def rotated(shape: Distance, axis: Sequence[float], degrees: float) -> Transform
     x, y, z = unit_vector("rotated", "axis", axis).tolist()
     angle = math.radians(check.number("rotated", "degrees", degrees))
     cross = torch.tensor(((0, -z, y), (z, 0, -x), (-y, x, 0)), dtype=torch.float64, device="cpu")
-    matrix = (
-        torch.eye(3, dtype=torch.float64, device="cpu")
-        + math.sin(angle) * cross
-        + (1 - math.cos(angle)) * cross @ cross
-    )
+    identity = torch.eye(3, dtype=torch.float64, device="cpu")
+    matrix = identity + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
     return Transform(shape, matrix)
 
 

@@ -89,9 +89,8 @@ def _pack_textures(
     firsts, layouts, parts, total = dict[int, int](), [], [], 0
     for texture in textures:
         if id(texture) not in texels:
-            texels[id(texture)] = (
-                white if texture is None else _linear(torch.tensor(texture, device="cpu"))
-            )
+            srgb = None if texture is None else torch.tensor(texture, device="cpu")
+            texels[id(texture)] = white if srgb is None else _linear(srgb)
             firsts[id(texture)] = total
             parts.append(texels[id(texture)].view(-1, 4))
             total += len(parts[-1])

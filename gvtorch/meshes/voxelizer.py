@@ -141,10 +141,8 @@ class Voxelizer:
         self._wide = self.geometry.largest >= _FLOAT32_VOXELS * self.spacing
         # Shares of solids are exact in voxels of any size.
         self._exact_shares = {"coverage"} == {*channels} and bool(self.geometry.solid.all())
-        sample_offsets = torch.tensor(
-            list(itertools.product(range(_SAMPLES_PER_SIDE), repeat=3)), device="cpu"
-        )
-        self._sample_offsets = sample_offsets.to(self.device, torch.float64)
+        offsets = list(itertools.product(range(_SAMPLES_PER_SIDE), repeat=3))
+        self._sample_offsets = torch.tensor(offsets, dtype=torch.float64, device=self.device)
         painted = {"color", "normal", "material"} & {*channels}
         self.paint = Paint(mesh, self.geometry) if painted else None
 

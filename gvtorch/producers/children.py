@@ -230,9 +230,8 @@ class FromChildren(OfProducers):
 
 
 def _zeros(channels: Mapping[str, Channel], count: int, side: int) -> Blocks:
-    return {
-        name: to_numpy(
-            torch.zeros((count, *(side,) * 3, channel.width), dtype=channel.dtype, device="cpu")
-        )
-        for name, channel in channels.items()
-    }
+    zeros = {}
+    for name, channel in channels.items():
+        shape = (count, *(side,) * 3, channel.width)
+        zeros[name] = to_numpy(torch.zeros(shape, dtype=channel.dtype, device="cpu"))
+    return zeros

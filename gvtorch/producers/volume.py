@@ -86,12 +86,8 @@ class VolumeProducer(Producer):
         self._tables: dict[str, BrickTable] = {}  # by channel; rows by depth, z, y, x
         self._voxels: dict[str, Tensor] = {}  # by channel (v, c), in the same order
         self._nodes: dict[str, Tensor] = {}  # by channel (n, 3, c) low, high, mean, same order
-        self._grids = torch.empty(
-            0, device="cpu"
-        )  # (d, 4) for each depth: first node, nodes along z, y, x
-        self._sizes = torch.empty(
-            0, device="cpu"
-        )  # (d, 4) for each depth: first voxel, voxels along z, y, x
+        # (d, 4) for each depth: the first node or voxel, and nodes or voxels along z, y, x.
+        self._grids = self._sizes = torch.empty(0, device="cpu")
 
     def prepare(self, layout: Layout) -> None:
         """Makes all levels, and all bricks if `hold` is "bricks"."""

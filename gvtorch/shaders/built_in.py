@@ -69,7 +69,11 @@ _OPAQUE_LENGTH = 1e-20  # a reference length so short that any opacity above 0 b
 
 
 class Lit(LitShader):
-    """The transfer function with Blinn-Phong lighting on both sides of a surface."""
+    """The transfer function with Blinn-Phong lighting on both sides of a surface.
+
+    Attributes:
+        in_the_way: Shader whose alpha blocks the cones of `Lighting`; None: the transfer function.
+    """
 
     kind = "Lit"
     shadowed_kind = "ShadowedLit"

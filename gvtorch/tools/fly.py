@@ -96,6 +96,7 @@ class Fly:
             film = Video(self.output, width, height, fps=fps) if is_film else None
             writer = _FrameWriter(self.output, film)
             if self.stats is not None:  # at the end: a full disk leaves the old file
+                writer.stats_lines = []
                 stack.callback(writer.write_stats, self.stats)
             steps = math.inf if self._stands_still() else max(1, frames - 1 + self._loops())
             for time, frame_numbers in self._time_parts(frames):
@@ -266,7 +267,8 @@ class Fly:
             frames = default_frames if self.frames is None else self.frames
             return check.integer("fly", "--frames", frames, low=1), fps
         if self.frames is not None:
-            raise ValueError("--turntable and --frames both set the number: leave one out")
+            problem = "both set the number of pictures: leave one out"
+            raise ValueError(f"--turntable and --frames {problem}")
         if self.flight != "orbit":
             raise ValueError("--turntable goes once around: not with --path FILE.json")
         from ..viewer.flight import MAX_PICTURES
@@ -346,7 +348,7 @@ class _FrameWriter:
 
     def __init__(self, output: Path, film: Video | None) -> None:
         self._output, self._film = output, film
-        self.stats_lines: list[str] = []  # of JSON
+        self.stats_lines: list[str] | None = None  # of JSON, if statistics are wanted
         self.incomplete = 0
         self.cameras: dict[str, Camera] = {}
 
@@ -354,7 +356,8 @@ class _FrameWriter:
         name, stats = f"{number:04d}.png", picture.stats.as_dict()
         self.cameras[name] = camera
         self.incomplete += not stats.get("converged", True)
-        self.stats_lines.append(json.dumps({"picture": number, **stats}) + "\n")
+        if self.stats_lines is not None:
+            self.stats_lines.append(json.dumps({"picture": number, **stats}) + "\n")
         if self._film is not None:
             self._film.add(picture)
         else:

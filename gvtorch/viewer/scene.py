@@ -395,9 +395,7 @@ def node_boxes(tree: N3Tree, eye: tuple[float, float, float]) -> dict[str, Any]:
     low, size, _ = tree.place.unbind(0)
     fraction = float(tree.branching) ** -loc[:, 3:].to(torch.float64)
     centre = low + (loc[:, :3] + 0.5) * fraction * size  # (k, 3) world
-    distance = (centre - torch.tensor(eye, dtype=torch.float64, device="cpu").to(centre)).norm(
-        dim=1
-    )
+    distance = (centre - centre.new_tensor(eye)).norm(dim=1)
     nearest = distance.argsort(stable=True)[:_MAX_BOXES]
     return {
         "boxes": loc[nearest].tolist(),

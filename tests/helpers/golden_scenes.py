@@ -411,11 +411,9 @@ def camera_of(s: Settings) -> gv.Camera | gv.Rays:
     if kind in ("orbit", "batch"):
         distance = 0.2 if s["inside"] else 0.3 + s["away"]
         turn = 40 * s["fov"]
-        turns = (
-            torch.tensor([turn, turn + 70], dtype=torch.float64, device="cpu")
-            if kind == "batch"
-            else turn
-        )
+        turns = turn
+        if kind == "batch":
+            turns = torch.tensor([turn, turn + 70], dtype=torch.float64, device="cpu")
         return gv.Camera.orbit(turns, 100 * s["aim"][0], distance, s["fov"], width, height)
     if kind in ("directions", "rays"):
         return _own_rays(s, eye, target)

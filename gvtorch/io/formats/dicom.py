@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from ...base.boxes import check_extent
 from ..dicom_codecs import plugin_of
 from ..dicom_frames import DicomFrame, frames_of, image_info, order_frames
 from ..source import LPS_TO_RAS, Index, VolumeSource, place_axes
@@ -221,12 +222,14 @@ def _series_source(path: str, headers: list[Any]) -> DicomSource:
     rows, columns, samples = _image_shape(first)
     frames: list[DicomFrame] = []
     for header in headers:
+        count = _frame_count(header)
+        check_extent(header.filename, (count, rows, columns), max_values=1 << 40)
         if _image_shape(header) != (rows, columns, samples):
             raise ValueError(
                 f"{path}: a series of images of different sizes: {(rows, columns, samples)} and "
                 f"{_image_shape(header)} (rows, columns, samples, {Path(header.filename).name})"
             )
-        frames += frames_of(header, _frame_count(header))
+        frames += frames_of(header, count)
     times, affine, dropped, time_fields = order_frames(path, frames)
     depth, frames = len(times[0]), list(chain(*times))
     placement = place_axes(path, LPS_TO_RAS @ affine, (depth, rows, columns))
