@@ -50,7 +50,7 @@ def test_records_are_the_schema(name, expected):
 def test_samples_read_rays_and_the_first_fields():
     channel = TRACE[: TRACE.index(("range_tn2c", "Tensor"))]
     assert schema("sample_bricks")[: len(RAYS + channel)] == RAYS + channel
-    assert schema("sample_bricks_backward")[1:] == schema("sample_bricks")
+    assert schema("sample_bricks_backward")[7:] == schema("sample_bricks")
 
 
 def test_marks_are_all_that_is_written():

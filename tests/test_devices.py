@@ -95,3 +95,20 @@ def test_cuda_second_device(blobs):
     assert all(torch.equal(getattr(actual, n).cpu(), getattr(expected, n)) for n in FIELDS)
     resident = gv.render(tree, camera, SHADER)
     assert picture.stats.converged and torch.equal(picture.color.cpu(), resident.color)
+
+
+@pytest.mark.backend("cuda")
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="one CUDA device")
+def test_cuda_frames_are_captured_on_each_device(blobs):
+    """One after the other: torch's default stream for recording lies on the first device."""
+    cameras = [gv.Camera.orbit(turn, 20, width=32, height=32, distance=1.3) for turn in (0, 90)]
+    expected = [gv.render(gv.N3Tree.from_volume(blobs), camera, SHADER) for camera in cameras]
+    for device in ("cuda:1", "cuda:0", "cuda:1"):
+        with gv.Engine(gv.VolumeProducer(blobs), device=device) as engine:
+            graph = engine.capture(cameras[0], SHADER)
+            for camera, picture in zip(cameras, expected, strict=True):
+                for _ in range(100):
+                    actual, stats = graph.replay(camera)
+                    if stats.converged:
+                        break
+                assert stats.converged and torch.equal(actual.color.cpu(), picture.color)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -191,6 +192,14 @@ class LookAhead:
         return self._camera.numbers_ahead(now, before, self._frames, _STRIDE)
 
 
+@functools.cache
+def _recording_stream(device: torch.device) -> torch.cuda.Stream:
+    """Returns a device's stream for recording. torch's own default is one stream for all devices,
+    on the first that recorded: graphs of the others would be empty.
+    """
+    return torch.cuda.Stream(device)
+
+
 @contextmanager
 def _record_graph(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
     """Records the block's device work as a graph. Meanwhile Python collects no garbage: freeing
@@ -199,7 +208,9 @@ def _record_graph(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator
     gc_was_enabled = gc.isenabled()
     gc.disable()
     try:
-        with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+        stream = _recording_stream(device)
+        recording = torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local")
+        with torch.cuda.device(device), recording:
             yield
     finally:
         if gc_was_enabled:

@@ -17,6 +17,7 @@ from .registry import Backend, argument_names, choose_backend, fake_of, unavaila
 from .trace import check_channel, check_rays, check_real, check_trace, check_voxels
 
 _SEGMENT_BYTES = 84  # at most, in float64
+_PIECE_ENTRIES = 256  # most entries of a piece; see `_spreading_order`
 #: Arguments of `sample_bricks` that have gradients.
 _DIFFERENTIABLE = ("bricks_bzyxc", "constant_tnc")
 
@@ -225,15 +226,70 @@ def _save_samples(ctx: Any, inputs: tuple, output: Tensor) -> None:
     ctx.numbers = [None if isinstance(value, Tensor) else value for value in inputs]
 
 
+@torch.library.custom_op("gvtorch::spreading_order", mutates_args=())
+def _spreading_order(
+    segment_k: Tensor, node_s2: Tensor, brick_s2: Tensor, bricks: int, nodes: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Returns in what order the gradient of `sample_bricks` is added up: (e,) sorted entries, their
+    segments (e,) and lengths (e,), (p + 1,) first entries of pieces, (p,) rows of pieces, and (x,)
+    the pieces with rows; see `SpreadGradient` in csrc/shaders/segments.h.
+    """
+    if not len(node_s2):
+        segment_k = segment_k[:0]
+    run = _begins(segment_k).nonzero()[:, 0]
+    length = run.diff(append=run.new_tensor([len(segment_k)])).to(torch.int32)
+    segment = segment_k[run]
+    exists = ((segment >= 0) & (segment < len(node_s2)))[:, None]
+    index = segment.clamp(0, len(node_s2) - 1).to(torch.int64)
+    node, brick, none = node_s2[index], brick_s2[index], bricks + nodes
+    exists = exists & (node >= 0) & (node < nodes) & (brick < bricks)
+    exists[:, 1] &= node[:, 0] != node[:, 1]
+    word = torch.int32 if none < 2**31 else torch.int64  # less to sort
+    # What an entry adds to: a brick or, behind all of these, a node's constants.
+    target = torch.where(brick >= 0, brick.to(word), node.to(word) + bricks)
+    target, order = torch.where(exists, target, none).flatten().sort(stable=True)
+    begins = _begins(target)
+    index = torch.arange(len(target), device=target.device)
+    number = index - begins.nonzero()[:, 0][begins.cumsum(0) - 1]  # among those of its target
+    count = exists.sum().view(1)
+    piece = ((number % _PIECE_ENTRIES == 0) & (index < count)).nonzero()[:, 0]
+    is_added = number[piece] > 0
+    row = torch.where(is_added, is_added.cumsum(0) - 1, -1)
+    entry = torch.stack((2 * run, 2 * run + 1), 1).flatten()[order]
+    pieces = torch.cat((piece, count)), row, is_added.nonzero()[:, 0]
+    return entry, segment[order // 2], length[order // 2], *pieces
+
+
+def _begins(values: Tensor) -> Tensor:
+    """Returns (k,) bool, which of (k,) values differ from the one before."""
+    begins = torch.ones_like(values, dtype=torch.bool)
+    begins[1:] = values[1:] != values[:-1]
+    return begins
+
+
+@_spreading_order.register_fake
+def _fake_order(segment_k: Tensor, *_: Any) -> tuple[Tensor, ...]:
+    size = torch.library.get_ctx().new_dynamic_size
+    runs, pieces, rows = size(), size(), size()
+    counts, long = (pieces + 1, pieces, rows), torch.int64
+    entries = (segment_k.new_empty(2 * runs, dtype=dtype) for dtype in (long, None, None))
+    return (*entries, *(segment_k.new_empty(count, dtype=long) for count in counts))
+
+
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:
     """Returns the gradients by bricks and constants, in their dtype, and None for the rest."""
     pairs = zip(ctx.saved_tensors, ctx.numbers, strict=True)
     inputs = [number if tensor is None else tensor for tensor, number in pairs]
-    bricks, constants = torch.ops.gvtorch.sample_bricks_backward(grad_kc.contiguous(), *inputs)
-    names = argument_names(torch.ops.gvtorch.sample_bricks)
-    dtype = inputs[names.index("bricks_bzyxc")].dtype
-    grads = {"bricks_bzyxc": bricks.to(dtype), "constant_tnc": constants.to(dtype)}
-    return tuple(grads.get(name) for name in names)
+    named = dict(zip(argument_names(torch.ops.gvtorch.sample_bricks), inputs, strict=True))
+    bricks, constants = (named[name] for name in _DIFFERENTIABLE)
+    lists = (named["segment_k"], named["node_s2"], named["brick_s2"])
+    order = _spreading_order(*lists, len(bricks), constants[..., 0].numel())
+    backward = torch.ops.gvtorch.sample_bricks_backward
+    grads = backward(grad_kc.contiguous(), *order, *inputs)
+    by_name = {
+        name: grad.to(bricks.dtype) for name, grad in zip(_DIFFERENTIABLE, grads, strict=True)
+    }
+    return tuple(by_name.get(name) for name in named)
 
 
 def _save_composite(ctx: Any, inputs: tuple, output: tuple[Tensor, ...]) -> None:

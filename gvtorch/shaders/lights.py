@@ -95,14 +95,17 @@ class DirectionalLight(Checked):
         "angle": a_number(low=0, high=120),
     }
 
+    @property
+    def size(self) -> Number:
+        """Radius at distance 1: tan(angle / 2)."""
+        if isinstance(self.angle, Tensor):
+            return torch.tan(torch.deg2rad(self.angle) / 2)
+        return math.tan(math.radians(self.angle) / 2)
+
     def parameters(self) -> ShadeParameters:
         """See `Headlight`."""
         self.check_again()
-        if isinstance(self.angle, Tensor):
-            growth: Number = 2 * CONE_OF_DISC * torch.tan(torch.deg2rad(self.angle) / 2)
-        else:
-            growth = 2 * CONE_OF_DISC * math.tan(math.radians(self.angle) / 2)
-        kind = LightKind.DIRECTIONAL
+        kind, growth = LightKind.DIRECTIONAL, 2 * CONE_OF_DISC * self.size
         return ShadeParameters(self.direction, kind, self.color, light_growth=growth)
 
 

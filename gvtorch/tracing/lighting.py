@@ -18,13 +18,12 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from ..base import check
 from ..base.records import Hits, Rays
 from ..cameras.poses import Coordinates
 from ..ops import RayArguments
-from ..ops.reference.exact import dot, unit
+from ..ops.reference.exact import divide, dot, power, sqrt_exact, unit
 from ..ops.shading import ShadeParameters, Triple, pack
 from ..shaders.lights import (
     CONE_OF_DISC,
@@ -193,7 +192,7 @@ class Lighted:
         has_normal = (normal != 0).any(1)
         return _Points(
             position=origin + t[:, None] * direction,
-            normal=torch.where(has_normal[:, None], normalize(normal, dim=1), eye),
+            normal=torch.where(has_normal[:, None], unit(normal), eye),
             has_normal=has_normal & is_hit,
             eye=eye,
             width=width,
@@ -212,10 +211,10 @@ class Lighted:
         for light in self.lights:
             color = pack((light.color,), torch.float64, points.eye.device)
             beam, *_ = _light_direction(light, points)
-            facing = (points.normal * beam).sum(1).clamp(min=0)
+            facing = dot(points.normal, beam).clamp(min=0)
             facing = torch.where(points.has_normal, facing, 1.0)
-            half_vector = normalize(beam + points.eye, dim=1)
-            highlight = (points.normal * half_vector).sum(1).clamp(0, 1) ** shininess
+            half_vector = unit(beam + points.eye)
+            highlight = power(dot(points.normal, half_vector).clamp(0, 1), shininess)
             highlight = torch.where(points.has_normal & (facing > 0), highlight, 0.0)
             light_size = getattr(light, "angle", getattr(light, "radius", 0.0))
             # A tensor is not read: that would block.
@@ -247,10 +246,11 @@ class Lighted:
         end = torch.where(facing & points.is_hit, distance, start)
         blocked = torch.zeros_like(distance)
         for x, y in _disc_points(cones):
-            cone_direction = normalize(beam + size[:, None] * (x * right + y * up), dim=1)
+            cone_direction = unit(beam + size[:, None] * (x * right + y * up))
             cone_rays = self._cones_from(points, cone_direction, growth, start, end)
             hits = points.tally(self.blocker(cone_rays))
-            blocked = blocked + hits.alpha[:, 0] / cones
+            alpha = hits.alpha[:, 0]
+            blocked = blocked + divide(alpha, cones, alpha)
         return 1 - self.lighting.shadows * blocked
 
     def _hemisphere(self, points: _Points, rays: Rays) -> tuple[Tensor, Tensor]:
@@ -301,7 +301,7 @@ class Lighted:
         """
         direction = points.normal
         if beam is not None:
-            cosine = (direction * beam).sum(1, keepdim=True)
+            cosine = dot(direction, beam)[:, None]
             direction = direction + (beam - cosine * direction) / cosine.clamp(min=_MIN_LIFT_COSINE)
         height = lift * points.width.clamp(min=self.voxel)[:, None]
         return replace(points, position=points.position + height * direction)
@@ -312,10 +312,11 @@ class Lighted:
         """Returns cones from points, as wide there as the eye's ray; their width grows by `growth`
         (r,) per unit distance. A cone that ends where it starts is not traced.
         """
+        cone = torch.stack((points.width, growth), 1)
         return Rays(
             origin=points.position,
             direction=direction,
-            cone=torch.stack((points.width, growth), 1) / self.cone_scale,
+            cone=divide(cone, self.cone_scale, cone),
             range=torch.stack((start, end), 1),
             width=points.row_width,
         )
@@ -327,8 +328,7 @@ def _light_direction(light: Light, points: _Points) -> tuple[Tensor, Tensor, Ten
     if isinstance(light, DirectionalLight):
         to_light = -pack((light.direction,), torch.float64, device)
         beam = unit(to_light.expand_as(points.position))  # of any length but 0
-        angle = pack((light.angle,), torch.float64, device)
-        size = torch.tan(torch.deg2rad(angle) / 2).expand_as(nothing)
+        size = pack((light.size,), torch.float64, device).expand_as(nothing)
         return beam, torch.full_like(nothing, torch.inf), size
     if isinstance(light, PointLight):
         position, radius = pack((light.position, light.radius), torch.float64, device).split((3, 1))
@@ -337,8 +337,8 @@ def _light_direction(light: Light, points: _Points) -> tuple[Tensor, Tensor, Ten
     else:
         position, radius = points.headlight, nothing
     to_light = position - points.position
-    distance = to_light.norm(dim=1)
-    return normalize(to_light, dim=1), distance, radius / distance.clamp(min=1e-30)
+    distance = sqrt_exact(dot(to_light, to_light))
+    return unit(to_light), distance, radius / distance.clamp(min=1e-30)
 
 
 def _disc_points(count: int) -> Iterator[tuple[float, float]]:
@@ -364,8 +364,8 @@ def _orthogonal_pair(axis: Tensor) -> tuple[Tensor, Tensor]:
 def _hemisphere_directions(normal: Tensor, sample: Tensor, count: int) -> Iterator[Tensor]:
     """Yields `count` directions (r, 3), cosine-weighted around (r, 3) normals, from a sequence that
     fills the unit square evenly (Roberts, 2018). It begins at a different position for each pixel,
-    and continues from sample to sample. Made of integers, + - * / and roots: equal to an ulp on
-    every device.
+    and continues from sample to sample. Made of integers, + - * / and roots: the same bits on every
+    device.
     """
     right, up = _orthogonal_pair(normal)
     begin_x = _hash_32((sample & _MASK_32) + 1)
@@ -378,7 +378,7 @@ def _hemisphere_directions(normal: Tensor, sample: Tensor, count: int) -> Iterat
         )
         cosine, sine = _cosine_sine(y)
         tangent = cosine[:, None] * right + sine[:, None] * up
-        yield unit((1 - x).sqrt()[:, None] * normal + x.sqrt()[:, None] * tangent)
+        yield unit(sqrt_exact(1 - x)[:, None] * normal + sqrt_exact(x)[:, None] * tangent)
 
 
 def _hash_32(number: Tensor) -> Tensor:

@@ -8,6 +8,7 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 
 // The CPU's kernels are compiled once for each instruction set, each in its own namespace. Otherwise the linker would
 // merge functions, which might then run instructions that a machine does not have. The namespace is declared inline
@@ -119,21 +120,14 @@ GV_HD void store_stamp(int32_t* word, int32_t stamp) {
 #endif
 }
 
-// Adds atomically to a sum.
+// Adds atomically to a count, int32_t or int64_t.
 template <class T>
-GV_HD void add_to(T* sum, T value) {
+GV_HD void add_to(T* count, T more) {
 #ifdef __CUDA_ARCH__
-  if constexpr (sizeof(T) == 8 && static_cast<T>(0.5) == 0) {
-    atomicAdd(reinterpret_cast<unsigned long long*>(sum), static_cast<unsigned long long>(value));
-  } else {
-    atomicAdd(sum, value);
-  }
+  using Word = std::conditional_t<sizeof(T) == 8, unsigned long long, T>;
+  atomicAdd(reinterpret_cast<Word*>(count), static_cast<Word>(more));
 #else
-  T expected;
-  __atomic_load(sum, &expected, __ATOMIC_RELAXED);
-  T desired = expected + value;
-  while (!__atomic_compare_exchange(sum, &expected, &desired, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED))
-    desired = expected + value;
+  __atomic_fetch_add(count, more, __ATOMIC_RELAXED);
 #endif
 }
 // Raises a number atomically to at least `minimum`.

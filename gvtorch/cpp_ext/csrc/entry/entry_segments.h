@@ -73,7 +73,7 @@ GV_OP(SampleBricksOp, "sample_bricks", GV_SAMPLE_BRICKS, "Tensor value_kc");
 GV_OP(SampleBricksBackwardOp, "sample_bricks_backward", GV_SAMPLE_BRICKS_BACKWARD,
       "(Tensor grad_bzyxc, Tensor grad_tnc)");
 
-// Calls body(the op's FindSample, T{}).
+// Calls body(the op's FindSamples, T{}).
 template <class Op, class Body>
 void with_samples(const Op& a, const Body& body) {
   const Like like{a.origin_r3, a.distance_s3.scalar_type(), a.bricks_bzyxc.scalar_type()};
@@ -84,8 +84,8 @@ void with_samples(const Op& a, const Body& body) {
   const int64_t samples = a.segment_k.numel();
   with_real(a.distance_s3, [&](auto real) {
     using T = decltype(real);
-    FindSample<T> args{Walk<T>(trace_args),    trace_args.side, trace_args.border,
-                       trace_args.voxel_width, a.ray_s.numel(), trace_args.nodes};
+    FindSamples<T> args{Walk<T>(trace_args),    trace_args.side, trace_args.border,
+                        trace_args.voxel_width, a.ray_s.numel(), trace_args.nodes};
     GV_SAMPLES(GV_CHECK_AND_SET)
     body(args, real);
   });
@@ -93,12 +93,11 @@ void with_samples(const Op& a, const Body& body) {
 
 inline auto run(const SampleBricksOp& a) {
   Tensor value_kc;
-  with_samples(a, [&](const auto& find_sample, auto real) {
+  with_samples(a, [&](const auto& find, auto real) {
     with_voxel(voxel_type(a.bricks_bzyxc.scalar_type()), [&](auto voxel) {
       const int64_t samples = a.segment_k.numel();
-      SampleBricks<decltype(real), decltype(voxel)> args{find_sample, to_kernel(a.bricks_bzyxc),
-                                                         to_kernel(a.constant_tnc)};
-      value_kc = make_output(args.value_kc, a.distance_s3, {samples, find_sample.width});
+      SampleBricks<decltype(real), decltype(voxel)> args{find, to_kernel(a.bricks_bzyxc), to_kernel(a.constant_tnc)};
+      value_kc = make_output(args.value_kc, a.distance_s3, {samples, find.width});
       for_each(a.origin_r3, samples, args);
     });
   });
@@ -107,15 +106,18 @@ inline auto run(const SampleBricksOp& a) {
 
 inline auto run(const SampleBricksBackwardOp& a) {
   Tensor grad_bzyxc, grad_tnc;
-  with_samples(a, [&](const auto& find_sample, auto real) {
+  with_samples(a, [&](const auto& find, auto real) {
     const Like like{a.origin_r3, a.distance_s3.scalar_type()};
-    const int64_t samples = a.segment_k.numel(), voxel_width = find_sample.width;
-    const int64_t side = find_sample.side;
-    SpreadGradient<decltype(real)> args{find_sample};
+    const int64_t voxel_width = find.width, side = find.side;
+    STD_TORCH_CHECK(a.begin_p.numel() > 0, "gvtorch: begin_p needs an end");
+    SpreadGradient<decltype(real)> args{find, a.segment_k.numel(), a.entry_e.numel(), a.begin_p.numel() - 1,
+                                        a.added_x.numel()};
     GV_GRADIENT(GV_CHECK_AND_SET)
     grad_bzyxc = make_zeros(args.grad_bzyxc, a.grad_kc, {a.bricks_bzyxc.size(0), side, side, side, voxel_width});
     grad_tnc = make_zeros(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), voxel_width});
-    for_each(a.origin_r3, samples, args);
+    const Tensor row_xn = make_zeros(args.row_xn, a.grad_kc, {args.rows, find.numbers()});
+    for_each(a.origin_r3, args.pieces * args.kThreads, args);
+    for_each(a.origin_r3, args.rows * find.numbers(), AddRows<decltype(real)>{args});
   });
   return std::make_tuple(grad_bzyxc, grad_tnc);
 }

@@ -30,7 +30,15 @@ namespace gvtorch {
   X(Reals, distance_s3, 3 * args.segments) \
   X(Words, segment_k, samples)             \
   X(Words, number_k, samples)
-#define GV_GRADIENT(X) X(Reals, grad_kc, samples* voxel_width)
+// The gradient by the samples' values, and in what order it is spread; see SpreadGradient.
+#define GV_GRADIENT(X)                         \
+  X(Reals, grad_kc, args.samples* voxel_width) \
+  X(Longs, entry_e, args.entries)              \
+  X(Words, segment_e, args.entries)            \
+  X(Words, length_e, args.entries)             \
+  X(Longs, begin_p, args.pieces + 1)           \
+  X(Longs, row_p, args.pieces)                 \
+  X(Longs, added_x, args.rows)
 
 // Packed samples of rays: those of a ray are consecutive, from front to back. The limits use rays
 #define GV_PACKED(X)                           \
@@ -231,23 +239,32 @@ struct WriteSegments {
   }
 };
 
-// Finds what a sample of a segment reads: the bricks (or constants) of two nodes, and the weight of the coarse one.
+// Finds what the samples of a segment read: the bricks (or constants) of two nodes, and the weight of the coarse one.
 template <class T>
-struct FindSample {
+struct FindSamples {
   Walk<T> walk;                 // only rays and the shape of the tree
   int32_t side, border, width;  // of a channel's bricks; width: numbers per voxel
   int64_t segments, nodes;
   GV_SAMPLES(GV_TYPED_VIEW)
 
-  struct SampleSource {
-    Spot<T> fine, coarse;
-    T t, weight;
+  struct Source {
     bool valid = false;  // everything the segment refers to exists
+    bool mixed = false;
+    Spot<T> first, second;  // of the fine node, or of the one node that was asked for; of the coarse one, if mixed
+    T cone_near, cone_growth, voxel, blend;
+    T base, end, length;
+    int32_t count, level;  // number of the first interval; kOdd: there is one, from base to end
+
+    // Distance of a sample, the middle of an interval.
+    GV_HD T middle(int32_t number) const {
+      const T half = static_cast<T>(0.5);
+      return level < 0 ? base + (end - base) * half : base + (static_cast<T>(count + number) + half) * length;
+    }
+    GV_HD T weight(T t) const { return saturate((cone_near + cone_growth * t - voxel) * blend); }
   };
 
-  GV_HD SampleSource operator()(int64_t k) const {
-    SampleSource source;
-    const int64_t segment = segment_k[k];
+  GV_HD Source operator()(int64_t segment, bool only_fine = false, bool only_coarse = false) const {
+    Source source;
     if (segment < 0 || segment >= segments) return source;
     const TreeView& tree = walk.tree;
     const int32_t wanted = depth_s3[3 * segment + 2];
@@ -262,92 +279,162 @@ struct FindSample {
     }
     if (ray_number < 0 || ray_number >= walk.order.rays || wanted < 0 || wanted > tree.max_depth) return source;
     source.valid = true;
+    source.mixed = holders[1].node != holders[0].node;
     const Ray<T> ray(walk.rays, ray_number);
     const Digits<T> digits(tree, walk.levels, walk.rays, ray, distance_s3[3 * segment + 2]);
-    source.fine = source.coarse = Spot<T>(holders[0], digits, ray, border);
-    source.t = middle_of(segment, number_k[k]);
-    source.weight = 0;
-    if (holders[1].node != holders[0].node) {
-      source.coarse = Spot<T>(holders[1], digits, ray, border);
-      const T voxel = walk.levels.voxel[wanted];
-      const T blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - voxel);
-      source.weight = saturate((ray.cone(source.t) - voxel) * blend);
-    }
+    source.first = Spot<T>(only_coarse ? holders[1] : holders[0], digits, ray, border);
+    if (source.mixed && !only_fine && !only_coarse) source.second = Spot<T>(holders[1], digits, ray, border);
+    source.cone_near = ray.cone_near;
+    source.cone_growth = ray.cone_growth;
+    source.voxel = walk.levels.voxel[wanted];
+    source.blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - source.voxel);
+    source.base = distance_s3[3 * segment];
+    source.end = distance_s3[3 * segment + 1];
+    source.count = interval_s3[3 * segment];
+    source.level = interval_s3[3 * segment + 2];
+    source.length = walk.step;
+    for (int32_t power = 0; power < smaller(source.level, kMaxLevels); ++power)
+      source.length = source.length + source.length;
     return source;
   }
-  // Distance of the middle of a segment's interval.
-  GV_HD T middle_of(int64_t segment, int32_t number) const {
-    const int32_t level = interval_s3[3 * segment + 2];
-    const T base = distance_s3[3 * segment], end = distance_s3[3 * segment + 1];
-    if (level < 0) return base + (end - base) * static_cast<T>(0.5);
-    T length = walk.step;
-    for (int32_t power = 0; power < smaller(level, kMaxLevels); ++power) length = length + length;
-    const int32_t count = interval_s3[3 * segment] + number;
-    return base + (static_cast<T>(count) + static_cast<T>(0.5)) * length;
-  }
-  // Index of a brick's first number in the pool.
-  GV_HD int64_t first_number(int32_t brick) const { return static_cast<int64_t>(brick) * side * side * side * width; }
+  // How many numbers a brick has.
+  GV_HD int64_t numbers() const { return static_cast<int64_t>(side) * side * side * width; }
 };
 
 template <class T, class Voxel>
 struct SampleBricks {
-  FindSample<T> find_sample;
+  FindSamples<T> samples;
   const Voxel *bricks_bzyxc, *constant_tnc;
   T* value_kc = nullptr;
 
   GV_HD void operator()(int64_t k) const {
-    const auto source = find_sample(k);
-    const int32_t width = find_sample.width;
-    const bool mixed = source.coarse.node != source.fine.node;
+    const auto source = samples(samples.segment_k[k]);
+    const T t = source.valid ? source.middle(samples.number_k[k]) : 0;
+    const int32_t width = samples.width;
     for (int32_t c = 0; c < width; ++c) {
       T value = 0;
       if (source.valid) {
-        value = read(source.fine, source.t, c);
-        if (mixed) value = value + source.weight * (read(source.coarse, source.t, c) - value);
+        value = read(source.first, t, c);
+        if (source.mixed) value = value + source.weight(t) * (read(source.second, t, c) - value);
       }
       value_kc[k * width + c] = value;
     }
   }
   GV_HD T read(const Spot<T>& spot, T t, int32_t c) const {
-    const int32_t width = find_sample.width;
+    const int32_t width = samples.width;
     if (spot.brick < 0) return number<T>(constant_tnc[static_cast<int64_t>(spot.node) * width + c]);
-    const Voxel* voxels = bricks_bzyxc + find_sample.first_number(spot.brick) + c;
-    return trilinear(voxels, find_sample.side, width, spot.at(t));
+    return trilinear(bricks_bzyxc + spot.brick * samples.numbers() + c, samples.side, width, spot.at(t));
   }
 };
 
-// The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of.
+// The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of, and those of a brick are
+// added one after another, in the order of the samples, whatever runs beside. (Atomic sums would have other bits in
+// each run; they took longer, too.)
+//
+// An entry is a run of samples of one segment, and one of its two nodes. Entries are sorted by the brick (or constants)
+// they add to, and cut into pieces, each of which belongs to one brick. A brick's first piece adds to the gradient, its
+// others to rows of their own, which AddRows adds up.
+//
+//   entry_e     twice the first sample of each entry, and one more for the coarse node
+//   segment_e   its segment
+//   length_e    its number of samples
+//   begin_p     each piece's first entry, and the end of the last one
+//   row_p       the row that a piece adds to; -1: the gradient
+//   added_x     the pieces that have rows, in order
+//
+// On a GPU a piece has eight threads: each adds to those voxels whose three coordinates are odd or even as its number
+// says. A sample has one voxel for each of them.
 template <class T>
 struct SpreadGradient {
-  FindSample<T> find_sample;
+#ifdef __CUDACC__
+  static constexpr int kThreads = 8;  // of a piece
+#else
+  static constexpr int kThreads = 1;
+  static constexpr int64_t kChunkSize = 4;  // see for_each.h
+#endif
+  FindSamples<T> find;
+  int64_t samples, entries, pieces, rows;
   GV_GRADIENT(GV_TYPED_VIEW)
-  T *grad_bzyxc = nullptr, *grad_tnc = nullptr;
+  T *grad_bzyxc = nullptr, *grad_tnc = nullptr, *row_xn = nullptr;
 
-  GV_HD void operator()(int64_t k) const {
-    const auto source = find_sample(k);
-    if (!source.valid) return;
-    spread(source.fine, source.t, k, 1 - source.weight);
-    if (source.coarse.node != source.fine.node) spread(source.coarse, source.t, k, source.weight);
+  struct Entry {
+    int64_t first = 0, end = 0;  // samples
+    typename FindSamples<T>::Source source;
+    bool is_coarse = false;
+  };
+  // An entry without samples if something it refers to does not exist.
+  GV_HD Entry entry(int64_t e) const {
+    Entry found;
+    const int64_t first = e < 0 || e >= entries ? -1 : entry_e[e] / 2;
+    if (first < 0 || length_e[e] < 0 || first > samples - length_e[e]) return found;
+    found.is_coarse = entry_e[e] % 2 != 0;
+    found.source = find(segment_e[e], !found.is_coarse, found.is_coarse);
+    found.first = found.end = first;
+    if (found.source.valid && (found.source.mixed || !found.is_coarse)) found.end += length_e[e];
+    return found;
   }
-  GV_HD void spread(const Spot<T>& spot, T t, int64_t k, T share) const {
-    const int32_t side = find_sample.side, width = find_sample.width;
-    const T* grad_c = grad_kc + k * width;
+  // The gradient of a spot's brick, or of its constants.
+  GV_HD T* gradient(const Spot<T>& spot) const {
+    return spot.brick < 0 ? grad_tnc + static_cast<int64_t>(spot.node) * find.width
+                          : grad_bzyxc + spot.brick * find.numbers();
+  }
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t piece = index / kThreads, row = row_p[piece];
+    for (int64_t e = begin_p[piece]; e < smaller(begin_p[piece + 1], entries); ++e) {
+      const Entry found = entry(e);
+      const Spot<T>& spot = found.source.first;
+      T* sum = row >= 0 && row < rows ? row_xn + row * find.numbers() : gradient(spot);
+      int32_t next = found.first < found.end ? find.number_k[found.first] : 0;
+      for (int64_t k = found.first; k < found.end; ++k) {
+        const T t = found.source.middle(next);
+        next = k + 1 < found.end ? find.number_k[k + 1] : 0;  // read early: GPUs wait long for memory
+        const T weight = found.source.mixed ? found.source.weight(t) : 0;
+        add(spot, t, found.is_coarse ? weight : 1 - weight, grad_kc + k * find.width, sum, index % kThreads);
+      }
+    }
+  }
+  GV_HD void add(const Spot<T>& spot, T t, T share, const T* grad_c, T* sum, int32_t thread) const {
+    const int32_t width = find.width;
     if (spot.brick < 0) {
-      T* constant = grad_tnc + static_cast<int64_t>(spot.node) * width;
-      for (int32_t c = 0; c < width; ++c) add_to(constant + c, share * grad_c[c]);
+      for (int32_t c = 0; c < width && thread == 0; ++c) sum[c] = sum[c] + share * grad_c[c];
       return;
     }
-    const EightVoxels<T> corners(spot.at(t), side);
-    const auto& weight = corners.weight;
-    T* first = grad_bzyxc + find_sample.first_number(spot.brick);
-    for (int i = 0; i < 8; ++i) {
-      const int dx = i & 1, dy = i >> 1 & 1, dz = i >> 2;
-      const T corner_share = share * (dx ? weight[0] : 1 - weight[0]) * (dy ? weight[1] : 1 - weight[1]) *
-                             (dz ? weight[2] : 1 - weight[2]);
-      const int64_t z = corners.cell[2] + dz, y = corners.cell[1] + dy, x = corners.cell[0] + dx;
-      T* voxel_c = first + ((z * side + y) * side + x) * width;
-      for (int32_t c = 0; c < width; ++c) add_to(voxel_c + c, corner_share * grad_c[c]);
+    const EightVoxels<T> corners(spot.at(t), find.side);
+    for (int i = 0; i < 8 / kThreads; ++i) {
+      T corner_share = share;
+      int64_t voxel = 0, stride = width;
+      for (int axis = 0; axis < 3; ++axis) {
+        const int32_t cell = corners.cell[axis];
+        const int upper = (kThreads == 1 ? i >> axis : thread >> axis ^ cell) & 1;
+        corner_share = corner_share * (upper != 0 ? corners.weight[axis] : 1 - corners.weight[axis]);
+        voxel += (cell + upper) * stride;
+        stride *= find.side;
+      }
+      for (int32_t c = 0; c < width; ++c) sum[voxel + c] = sum[voxel + c] + corner_share * grad_c[c];
     }
+  }
+};
+
+// Adds each brick's rows to its gradient, in order. Index: a number of a row; that of a brick's first row does it.
+template <class T>
+struct AddRows {
+  SpreadGradient<T> spread;
+
+  GV_HD void operator()(int64_t index) const {
+    const int64_t numbers = spread.find.numbers(), number = index % numbers;
+    int64_t row = index / numbers;
+    const int64_t piece = spread.added_x[row];
+    if (piece < 0 || piece >= spread.pieces || (row > 0 && spread.added_x[row - 1] == piece - 1)) return;
+    const auto found = spread.entry(spread.begin_p[piece]);
+    if (found.first >= found.end || (found.source.first.brick < 0 && number >= spread.find.width)) return;
+    T* sum = spread.gradient(found.source.first) + number;
+    T total = *sum;
+    do {
+      total = total + spread.row_xn[row * numbers + number];
+      ++row;
+    } while (row < spread.rows && spread.added_x[row] == spread.added_x[row - 1] + 1);
+    *sum = total;
   }
 };
 
