@@ -34,7 +34,6 @@ from ..io.stores.coarse import make_channel
 from ..io.stores.store import Store
 from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
-from ..ops.reference.shaders import shader_number
 from ..ops.reference.stored_color import FilteredNumbers
 from ..ops.shading import COLOR_WIDTH, LIT_COLOR_WIDTH, ShadeParameters, channel_widths
 from ..pool import Channel, N3Tree
@@ -83,8 +82,6 @@ class Filtered(Shader):
     times as fine for lit matter, 1.6 times where colours differ by direction.
     """
 
-    kind = "Filtered"
-    lit_kind = "FilteredLit"  # of a `Lit`
     reads_coarse = True
     transfer: TransferFunction | Lit
     checks: ClassVar[Mapping[str, Check]] = {
@@ -252,6 +249,10 @@ class Filtered(Shader):
         return cls(shader, channel, component, directions=coarse.width != numbers)
 
     @property
+    def kind(self) -> str:  # type: ignore[override]
+        return "FilteredLit" if isinstance(self.transfer, Lit) else "Filtered"
+
+    @property
     def function(self) -> TransferFunction:
         """The transfer function itself."""
         return self.transfer.transfer if isinstance(self.transfer, Lit) else self.transfer
@@ -357,10 +358,7 @@ class Filtered(Shader):
             raise ValueError(f"{context}: {made}, or it was edited: {hint}")
         widths = channel_widths(self.numbers)
         check_width(f"{context}: filtered colours need", tree, self.other, *widths)
-        arguments = super().shading(context, tree)
-        if arguments is None or self.numbers == COLOR_WIDTH:
-            return arguments
-        return arguments._replace(shader=shader_number(self.lit_kind))
+        return super().shading(context, tree)
 
 
 class _StoreField:
