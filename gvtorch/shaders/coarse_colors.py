@@ -18,6 +18,7 @@ from torch import Tensor
 from ..base import boxes
 from ..base.stage import Progress
 from ..base.volume import DIRECTIONS, Volume, to_numpy
+from ..ops.reference.march import Transfer
 from ..ops.shading import COLOR_WIDTH, FAINT, LIT_COLOR_WIDTH
 from .shader import ColorTable, row_and_fraction
 
@@ -127,7 +128,7 @@ def _sums_along(
             coarse[level] = torch.zeros((2, painter.width + 1, *counts), **float32)
     for a, b, tile_values in _tiles(field, column_axis, tile):
         values = tile_values.to(device).to(torch.float32)
-        empty = not _is_visible(values, painter.table)
+        empty = bool(Transfer(painter.table).transparent(*values.aminmax()))
         if empty:  # the fewest intervals that make up a voxel of level 0
             shape = (2 * branching, *(2 * n - 4 for n in tile_values.shape[1:]))
             color = torch.zeros((painter.width - 1, *shape), **float32)
@@ -205,16 +206,6 @@ def _tiles(field: FinestVoxels, column_axis: int, tile: int) -> Iterator[tuple[i
         _, *sizes = values.shape
         for a, b in itertools.product(*(range(0, size - 2, tile) for size in sizes)):
             yield corner[0] + a, corner[1] + b, values[:, a : a + tile + 2, b : b + tile + 2]
-
-
-def _is_visible(values: Tensor, table: ColorTable) -> bool:
-    """Returns whether any value between a part's smallest and largest has an opacity."""
-    last = len(table.opaque_m) - 1
-    low, high = table.domain_2.tolist()
-    row_positions = (torch.stack(values.aminmax()) - low) * (last / (high - low))
-    first_row, last_row = (int(row) for row in row_positions.clamp(0, last).tolist())
-    visible_counts = table.opaque_m[[max(first_row - 1, 0), min(last_row + 1, last)]].tolist()
-    return visible_counts[1] > (visible_counts[0] if first_row > 0 else 0)
 
 
 def _upsampled(values: Tensor, slope_axis: int | None = None) -> Tensor:
