@@ -48,9 +48,8 @@ from .coarse_colors import (
 from .shader import Sampling, Shader, check_width
 from .transfer_function import TransferFunction
 
-#: Results of `finer`: how many times finer than for other shaders levels are chosen. Fitted: the
-#: finest voxels are not filtered, so the sharper their detail, the smaller the pixels must be that
-#: are drawn from them, and the smaller this factor.
+#: Results of `finer`, fitted. With a larger factor the finest voxels, which are not filtered, are
+#: drawn in larger pixels, too; so it is smaller where they hold sharper detail: normals, walls.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE_ALPHA = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data

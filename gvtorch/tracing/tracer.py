@@ -74,7 +74,7 @@ class Tracer:
             branching=tree.branching,
             max_depth=tree.depth,
             border=tree.bricks.border,
-            root_voxel=tree.root_voxel * shader.finer(tree),
+            root_voxel=tree.root_voxel * shader.finer(tree),  # voxels taken for larger are refined
             cone_scale=scale,
             step=step,
             bricks_bzyxc=tree.bricks.bricks[channel],
