@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -27,31 +27,27 @@ _MIN_LIGHT = 0.001  # weight of a column that no light reaches
 _HIDDEN_BELOW = 0.5  # a voxel with less than this share of its neighbours' light is hidden
 
 
-class FinestVoxels(Protocol):
-    """The finest voxels, which need not fit into memory."""
+@dataclass(frozen=True)
+class FinestVoxels:
+    """One number of the finest voxels, which need not fit into memory."""
 
-    shape: tuple[int, int, int]  # z, y, x
+    shape: tuple[int, ...]  # z, y, x
     slab_side: int  # voxels, of the slabs that are read at once, on the two axes across columns
+    #: Returns the box (z, y, x) on the CPU from one corner to another; beyond the field the
+    #: outermost voxels repeat.
+    read: Callable[[Sequence[int], Sequence[int]], Tensor]
 
-    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """Returns a box (z, y, x) on the CPU; beyond the field the outermost voxels repeat."""
+    @classmethod
+    def of(cls, volume: Volume, component: int) -> FinestVoxels:
+        """Returns those of a volume."""
+        values = to_numpy(volume.data[..., component])
 
+        def read(low: Sequence[int], high: Sequence[int]) -> Tensor:
+            start, stop = boxes.clamped_box(low, high, values.shape)
+            part = values[boxes.index(start, stop)]
+            return torch.from_numpy(boxes.repeat_edges(part, start, low, high))
 
-class VolumeField:
-    """One number of a volume's voxels."""
-
-    slab_side = 256
-
-    def __init__(self, volume: Volume, component: int) -> None:
-        self._values = to_numpy(volume.data[..., component])
-        z, y, x = self._values.shape
-        self.shape = (z, y, x)
-
-    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """See `FinestVoxels`."""
-        start, stop = boxes.clamped_box(low, high, self.shape)
-        part = self._values[boxes.index(start, stop)]
-        return torch.from_numpy(boxes.repeat_edges(part, start, low, high))
+        return cls(values.shape, 256, read)
 
 
 def write_colors(

@@ -40,7 +40,6 @@ from ..pool import Channel, N3Tree
 from .built_in import Lit
 from .coarse_colors import (
     FinestVoxels,
-    VolumeField,
     mean_of_directions,
     without_light,
     write_colors,
@@ -53,6 +52,7 @@ from .transfer_function import TransferFunction
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE_ALPHA = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data
+_SLAB_SIDE = 64  # voxels of a store's slabs: the side of its chunks
 _BATCH_BRICKS = 4096  # bricks cut at a time
 
 
@@ -203,9 +203,13 @@ class Filtered(Shader):
         color_channel, made_of = shader.colors(opened.spacing), shader.made_of
         voxel_width = len(DIRECTIONS) * (shader.numbers + 1)  # see `write_colors`
 
+        def read(low: Sequence[int], high: Sequence[int]) -> Tensor:
+            values = opened.read_region(0, low, high, timeout=_TIMEOUT)[..., component]
+            return torch.from_numpy(np.ascontiguousarray(values))
+
         def fill(levels: Sequence[np.ndarray]) -> None:
             out = [torch.from_numpy(level) for level in levels]
-            field = _StoreField(opened, component)
+            field = FinestVoxels(opened.extent[::-1], _SLAB_SIDE, read)
             shader.write(field, opened.spacing, 2, out, torch_device, progress)
 
         def keep(colors: np.ndarray) -> np.ndarray:
@@ -295,7 +299,7 @@ class Filtered(Shader):
         """Computes the colours of a volume's coarse levels on a device, see `of`, and yields them,
         finest level first, as (z, y, x, width) float16 on the CPU. The width is that of `colors`.
         """
-        field = VolumeField(volume, self.component or 0)
+        field = FinestVoxels.of(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
         shapes = [[-(-n // side) for n in field.shape] for side in sides]
         voxel_width = len(DIRECTIONS) * (self.numbers + 1)  # see `write_colors`
@@ -358,19 +362,3 @@ class Filtered(Shader):
         widths = channel_widths(self.numbers)
         check_width(f"{context}: filtered colours need", tree, self.other, *widths)
         return super().shading(context, tree)
-
-
-class _StoreField:
-    """One number of the finest voxels of a store."""
-
-    slab_side = 64  # the side of its chunks
-
-    def __init__(self, store: Store, component: int) -> None:
-        self._store, self._component = store, component
-        x, y, z = store.extent
-        self.shape = (z, y, x)
-
-    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """See `FinestVoxels`."""
-        values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
-        return torch.from_numpy(np.ascontiguousarray(values))
