@@ -106,7 +106,7 @@ class Lit(LitShader):
 
     @property
     def kind(self) -> str:  # type: ignore[override]
-        return "ShadowedLit" if self.is_shadowed else "Lit"
+        return "ShadowedLit" if self.shadows or self.octaves else "Lit"
 
     @property
     def shows_nothing(self) -> bool:
@@ -179,7 +179,7 @@ class StoredColor(LitShader):
 
     @property
     def kind(self) -> str:  # type: ignore[override]
-        return "ShadowedColor" if self.is_shadowed else "StoredColor"
+        return "ShadowedColor" if self.shadows or self.octaves else "StoredColor"
 
     def own_numbers(self, tree: N3Tree) -> StoredColorNumbers:
         channel = tree.bricks.channels[str(self.channel)]
@@ -187,7 +187,7 @@ class StoredColor(LitShader):
             scale=1 / number_of_one(channel.dtype),
             reference=self.reference or min(tree.spacing),
             premultiplied=float(self.premultiplied or channel.width != COLOR_WIDTH),
-            lit=self.lit or self.is_shadowed,
+            lit=self.lit or self.shadows or self.octaves > 0,
         )
 
     def unlit(self) -> Self:

@@ -205,11 +205,6 @@ class LitShader(Shader):
     def material(self) -> ShadeParameters:
         return self.light.parameters()._replace(**{name: getattr(self, name) for name in _MATERIAL})
 
-    @property
-    def is_shadowed(self) -> bool:
-        """Whether samples are shadowed, as surfaces or as a medium that scatters light."""
-        return self.shadows or self.octaves > 0
-
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
         if self.octaves or (self.shadows and not self.takes_shadows):
             self.check_scattering(context)
