@@ -105,7 +105,7 @@ def test_a_row_of_voxels_lets_through_what_its_columns_do_together():
     values = (plane + 0.2 * torch.rand((32, 16, 16), generator=generator)).clamp(0, 1)
     shader = gv.Filtered(MISTY)
     volume = gv.Volume(values)
-    field = coarse_colors.VolumeField(volume, 0)
+    field = coarse_colors.FinestVoxels.of(volume, 0)
     through = {}
     for directions in (False, True):
         shader._directions = directions

@@ -218,6 +218,16 @@ def test_a_projection_is_that_of_all_that_is_kept(blobs, compiled, kind):
         trace(tree, compiled, rays, shader, clip=dataclasses.replace(CLIPS["cut"], caps=True))
 
 
+def test_a_projection_in_pieces_has_the_bits_of_the_whole(blobs, compiled):
+    """A box that removes nothing cuts rays into pieces, and their common colour is looked up."""
+    ramp = gv.TransferFunction([(0.1, 0)], [(0.1, 0, 0, 1), (0.4, 1, 0.3, 0), (0.9, 1, 0, 0.2)])
+    tree, shader = gv.N3Tree.from_volume(blobs, 4), gv.Projection("maximum", ramp)
+    rays, nothing = camera_rays(tree, 24, distance=1.2), gv.Clip(without=[((500,) * 3, (501,) * 3)])
+    whole, _ = trace(tree, compiled, rays, shader)
+    pieces, _ = trace(tree, compiled, rays, shader, clip=nothing)
+    assert len(whole["color"].unique()) > 200 and torch.equal(whole["color"], pieces["color"])
+
+
 @pytest.mark.parametrize("kind", ["maximum", "minimum", "mean"])
 def test_a_projection_in_pieces_is_streamed_and_waits_for_nobody(blobs, compiled, kind):
     device, camera = DEVICES[compiled], gv.Camera.orbit(30, 20, 1.2, width=24, height=20)

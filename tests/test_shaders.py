@@ -451,12 +451,10 @@ def test_a_kind_has_a_struct_a_twin_and_a_class():
         declared = tuple(getattr(twin, name) for name in FACTS)
         assert declared == facts_of(struct, structs), kind
         assert is_shadowed == (shadows == "true") and twin.__name__ == struct, kind
-    others = (gv.Filtered, gv.Channels, gv.Labels)
-    classes = [*others, *(getattr(gv, name) for name in built_in.__all__)]
     for kind in SHADER_KINDS:
         assert f"struct {kind} " in structs or kind.startswith("Shadowed"), kind
-        names = ("kind", "shadowed_kind", "lit_kind")
-        assert any(kind in [getattr(c, name, "") for name in names] for c in classes), kind
+    shaders = [*SHADERS.values(), gv.Filtered(SHADER), gv.Filtered(gv.Lit(SHADER))]
+    assert {shader.kind for shader in shaders} == {*SHADER_KINDS}
     with pytest.raises(ValueError, match=r"shader: kind must be 'Lit', .*, got 'Lamp'"):
         shader_number("Lamp")
 
@@ -469,14 +467,10 @@ def test_faint_moments_are_divided_and_multiplied_by_the_same_number():
     assert mean_of_directions(written)[4:].tolist() == [1 / FAINT] * 6
 
 
-def test_each_shader_of_the_command_line_has_its_line_of_help():
-    assert list(built_in.HELP) == list(built_in.BY_NAME)
-
-
 @pytest.mark.parametrize("name", built_in.BY_NAME)
 def test_every_named_shader_draws(tree, name):
     """The shaders of the command line need only a transfer function and a level."""
-    shader = built_in.BY_NAME[name](SHADER, 0.5)
+    shader = built_in.named_shader(name, SHADER, 0.5)
     picture = gv.render(tree, gv.Camera.orbit(width=16, height=16, distance=1.4), shader)
     assert picture.alpha.max() > 0.3 and picture.color.max() > 0.1
 

@@ -25,8 +25,11 @@ def declared_names(module: str, variable: str) -> list[str]:
 
 
 def declared_texts(module: str, variable: str) -> dict[str, str]:
-    """Returns the dict of strings that a module assigns to a variable, likewise."""
-    return ast.literal_eval(_assigned(module, variable))
+    """Returns the first item of each tuple in such a dict, strings, by key."""
+    value = _assigned(module, variable)
+    assert isinstance(value, ast.Dict)
+    texts = [ast.literal_eval(item.elts[0]) for item in value.values if isinstance(item, ast.Tuple)]
+    return dict(zip(declared_names(module, variable), texts, strict=True))
 
 
 def imported_names(path: str, room: str = "") -> dict[str, str]:

@@ -32,7 +32,7 @@ from ..shaders import (
     StoredColor,
     TransferModule,
 )
-from ..shaders.built_in import BY_NAME
+from ..shaders.built_in import BY_NAME, named_shader
 from ..tracing import Lighting, trace
 from .march import Size, difference, op_milliseconds, rates, rgba
 from .record import Record, clock
@@ -57,7 +57,7 @@ class Variant:
 
 
 def _built_in(name: str, scene: BenchScene) -> Shader:
-    return BY_NAME[name](scene.shader, scene.surface)
+    return named_shader(name, scene.shader, scene.surface)
 
 
 def _module_shader(scene: BenchScene) -> Shader:

@@ -91,7 +91,7 @@ class TraceArguments(NamedTuple):
 class ShadeArguments(NamedTuple):
     """The fused or user's shader, and the further channels it reads; see csrc/shaders/shaders.h."""
 
-    shader: int = 0  # a `shading.shader_number`; 0 for a user's op
+    shader: int = 0  # number of its kind (`reference.shaders.shader_number`); 0 for a user's op
     features: int = 0  # width of its features: c for Features, 1 for Projection and Labels, else 0
     normal_bzyxc: Tensor | None = None  # channel of normals, c = 3; None: normals from the gradient
     normal_tnc: Tensor | None = None  # its constants

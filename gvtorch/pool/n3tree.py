@@ -124,9 +124,10 @@ class N3Tree:
         return min(self.spacing) * self.branching**self.depth
 
     @property
-    def flatness(self) -> float:
-        """Smallest over largest side of a voxel. Cones are narrowed by this factor, so that a level
-        is chosen by its voxels' largest side (no detail is lost) and intervals fit the smallest.
+    def isotropy(self) -> float:
+        """Smallest over largest side of a voxel; 1 for cubes. Kernels compare cones with a voxel's
+        smallest side; cones narrowed by this factor are as wide as its largest, so no detail is
+        lost.
         """
         return min(self.spacing) / max(self.spacing)
 

@@ -24,7 +24,7 @@ _SHARED_ATTRIBUTES = ("extent", "spacing", "origin")  # what the volumes of one 
 @dataclass(frozen=True)
 class Channel:
     """What a voxel of a channel holds: `width` numbers of `dtype`. A coarse channel exists only
-    above the finest level: it says more about the finest voxels below each coarse voxel.
+    above the finest level: it describes the finest voxels below each coarse voxel.
     """
 
     dtype: torch.dtype = torch.float32  # of the numbers: integers of 8 or 16 bits, floats to 32

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Self
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from ..base import check
 from ..base.check import extent_of
 from ..base.constants import MAX_BRANCHING
 from ..base.rows import distinct_rows
-from ..base.volume import Volume, movable
+from ..base.volume import movable
 from ..pool import Channel
 from ..pool.pools import phrase
 from ..pool.staging import TableRows, Voxels, on_device
@@ -146,33 +146,6 @@ class Bricks(Answer):
         constant = self.constants.get(name, values.new_zeros(len(uniform))).to(values)
         stored = torch.where(uniform.view(shape), movable(constant).view(shape), movable(values))
         return stored.view(values.dtype)
-
-
-@runtime_checkable
-class CoarseColors(Protocol):
-    """Interface of makers of a coarse channel: that of `Filtered`, which can't be imported here."""
-
-    other: str | None  # name of the channel
-    component: int | None  # index of the number of a voxel that it is made of
-
-    @property
-    def made_of(self) -> Mapping[str, Any]:
-        """What the channel was made of, as plain values."""
-
-    def colors(self, spacing: tuple[float, float, float]) -> Channel:
-        """Returns dtype and width of the channel, for voxels of this size."""
-
-    def levels(
-        self, volume: Volume, branching: int, depth: int, device: torch.device, width: int
-    ) -> Iterator[Tensor]:
-        """Yields (z, y, x, width) of each coarse level, the finest of them first, on the CPU."""
-
-
-def check_filtered(context: str, value: Any) -> None:
-    """Raises ValueError unless a user's argument has the form of `CoarseColors`."""
-    if not isinstance(value, CoarseColors):
-        kind = type(value).__name__
-        raise ValueError(f"{context}: filtered must be a Filtered, got {kind}")
 
 
 class Producer(torch.nn.Module):

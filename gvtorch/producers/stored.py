@@ -24,9 +24,10 @@ from ..base.stage import stage
 from ..io.stores.store import Store
 from ..pool import Channel
 from ..pool.pyramid import NodeSummary
+from ..shaders.filtered import Filtered
 from .answer import regions_of
 from .nodes import Layout, Nodes
-from .producer import Bricks, CoarseColors, Producer, Region, Regions, check_filtered
+from .producer import Bricks, Producer, Region, Regions
 
 _TILE_CELLS = 32  # cells along a side of the cubes in which cells are read
 _GROUP_BYTES = 32 * 10**6  # of cubes that are held at a time in addition to the cache
@@ -108,9 +109,9 @@ class _Cubes:
         return self.bricks_per_side * self.brick_size
 
 
-def _coarse_channel(store: Store, filtered: CoarseColors) -> dict[str, Channel]:
+def _coarse_channel(store: Store, filtered: Filtered) -> dict[str, Channel]:
     """Returns the channel of a shader's filtered colours; ValueError if the store lacks them."""
-    check_filtered("StoredProducer", filtered)
+    check.instance("StoredProducer", "filtered", filtered, Filtered)
     if not store.all_channels:
         raise ValueError(
             f"{store.location}: filtered colours are of all channels: leave channels out"
@@ -143,7 +144,7 @@ class StoredProducer(Producer):
         image: str | None = None,
         time: int = 0,
         channels: Sequence[int] | None = None,
-        filtered: CoarseColors | None = None,
+        filtered: Filtered | None = None,
     ) -> None:
         """Opens the store and starts the threads.
 

@@ -15,9 +15,10 @@ from ..pool import BrickTable, Channel
 from ..pool.pools import checked_threshold, labels_by_channel, volumes_by_channel
 from ..pool.pyramid import Level, NodeSummary, levels_by_depth
 from ..pool.staging import mapped, wide_rows
+from ..shaders.filtered import Filtered
 from .answer import regions_of
 from .nodes import Layout, Nodes
-from .producer import Bricks, CoarseColors, Producer, Regions, by_depth, check_filtered
+from .producer import Bricks, Producer, Regions, by_depth
 
 _BATCH_BRICKS = 4096  # bricks cut from a level at a time
 
@@ -35,7 +36,7 @@ class VolumeProducer(Producer):
         *,
         threshold: float | None = None,
         hold: Literal["voxels", "bricks", "mapped"] = "voxels",
-        filtered: CoarseColors | None = None,
+        filtered: Filtered | None = None,
         branching: int = 2,
     ) -> None:
         """Sets the volume, which becomes channel "value", or one volume for each channel.
@@ -62,7 +63,7 @@ class VolumeProducer(Producer):
         first = next(iter(volumes.values()))
         channels = {name: Channel.of(volume) for name, volume in volumes.items()}
         if filtered is not None:
-            check_filtered("VolumeProducer", filtered)
+            check.instance("VolumeProducer", "filtered", filtered, Filtered)
             name, last = str(filtered.other), first.width - 1
             label = "component of filtered"
             check.integer("VolumeProducer", label, filtered.component, low=0, high=last)

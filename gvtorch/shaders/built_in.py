@@ -75,8 +75,7 @@ class Lit(LitShader):
         in_the_way: Shader whose alpha blocks the cones of `Lighting`; None: the transfer function.
     """
 
-    kind = "Lit"
-    shadowed_kind = "ShadowedLit"
+    takes_shadows = True
     transfer: TransferFunction
     checks: ClassVar[Mapping[str, Check]] = {
         "transfer": _TRANSFER_CHECK,
@@ -106,6 +105,10 @@ class Lit(LitShader):
         self.transfer, self.shadows, self.in_the_way = transfer, shadows, in_the_way
 
     @property
+    def kind(self) -> str:  # type: ignore[override]
+        return "ShadowedLit" if self.shadows or self.octaves else "Lit"
+
+    @property
     def shows_nothing(self) -> bool:
         return self.transfer.shows_nothing
 
@@ -133,8 +136,7 @@ class StoredColor(LitShader):
     directions, as `Volume.directional` makes them: a ray sees a mix of the three that it follows.
     """
 
-    kind = "StoredColor"
-    shadowed_kind = "ShadowedColor"
+    takes_shadows = True
     component = 3
     checks: ClassVar[Mapping[str, Check]] = {
         "channel": name_text,
@@ -174,6 +176,10 @@ class StoredColor(LitShader):
         self.channel = channel
         self.reference, self.premultiplied = reference, premultiplied
         self.lit, self.shadows = lit or self.normals is not None, shadows
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        return "ShadowedColor" if self.shadows or self.octaves else "StoredColor"
 
     def own_numbers(self, tree: N3Tree) -> StoredColorNumbers:
         channel = tree.bricks.channels[str(self.channel)]
@@ -467,29 +473,26 @@ class GradientMagnitude(Shader):
         return GradientMagnitudeNumbers(domain if self.full is None else self.full)
 
 
-#: Makers of single-channel shaders by name, from a transfer function and a level: `gvtorch render
-#: --shader` offers them, and `gvtorch bench shaders` measures them.
-BY_NAME: Mapping[str, Callable[[TransferFunction, float], Shader]] = {
-    "plain": lambda transfer, _: transfer,
-    "lit": lambda transfer, _: Lit(transfer),
-    "preintegrated": lambda transfer, _: PreIntegrated(transfer),
-    "isosurface": lambda _, level: Isosurface(level),
-    "maximum": lambda transfer, _: Projection("maximum", transfer),
-    "minimum": lambda transfer, _: Projection("minimum", transfer),
-    "mean": lambda transfer, _: Projection("mean", transfer),
-    "gradient": lambda transfer, _: GradientMagnitude(transfer),
+#: Single-channel shaders by name: what each shows, and how it is made of a transfer function and a
+#: level. `gvtorch render --shader` offers them, and `gvtorch bench shaders` measures them.
+BY_NAME: Mapping[str, tuple[str, Callable[[TransferFunction, float], Shader]]] = {
+    "plain": ("transfer function alone", lambda transfer, _: transfer),
+    "lit": ("with lighting", lambda transfer, _: Lit(transfer)),
+    "preintegrated": (
+        "plain, but keeps thin peaks of the function",
+        lambda transfer, _: PreIntegrated(transfer),
+    ),
+    "isosurface": ("surface at --value", lambda _, level: Isosurface(level)),
+    "maximum": ("of the values along a ray", lambda transfer, _: Projection("maximum", transfer)),
+    "minimum": ("of the values along a ray", lambda transfer, _: Projection("minimum", transfer)),
+    "mean": ("of the values along a ray", lambda transfer, _: Projection("mean", transfer)),
+    "gradient": ("boundaries", lambda transfer, _: GradientMagnitude(transfer)),
 }
-#: What each of them shows, for the help of `--shader`.
-HELP = {
-    "plain": "transfer function alone",
-    "lit": "with lighting",
-    "preintegrated": "plain, but keeps thin peaks of the function",
-    "isosurface": "surface at --value",
-    "maximum": "of the values along each ray",
-    "minimum": "of the values along each ray",
-    "mean": "of the values along each ray",
-    "gradient": "boundaries",
-}
+
+
+def named_shader(name: str, transfer: TransferFunction, level: float = 0.0) -> Shader:
+    """Returns the shader of `BY_NAME` for a transfer function and a level."""
+    return BY_NAME[name][1](transfer, level)
 
 
 def _projection(which: Any) -> str:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from torch import Tensor
 from ..base import boxes
 from ..base.stage import Progress
 from ..base.volume import DIRECTIONS, Volume, to_numpy
+from ..ops.reference.march import Transfer
 from ..ops.shading import COLOR_WIDTH, FAINT, LIT_COLOR_WIDTH
 from .shader import ColorTable, row_and_fraction
 
@@ -26,31 +27,27 @@ _MIN_LIGHT = 0.001  # weight of a column that no light reaches
 _HIDDEN_BELOW = 0.5  # a voxel with less than this share of its neighbours' light is hidden
 
 
-class FinestVoxels(Protocol):
-    """The finest voxels, which need not fit into memory."""
+@dataclass(frozen=True)
+class FinestVoxels:
+    """One number of the finest voxels, which need not fit into memory."""
 
-    shape: tuple[int, int, int]  # z, y, x
+    shape: tuple[int, ...]  # z, y, x
     slab_side: int  # voxels, of the slabs that are read at once, on the two axes across columns
+    #: Returns the box (z, y, x) on the CPU from one corner to another; beyond the field the
+    #: outermost voxels repeat.
+    read: Callable[[Sequence[int], Sequence[int]], Tensor]
 
-    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """Returns a box (z, y, x) on the CPU; beyond the field the outermost voxels repeat."""
+    @classmethod
+    def of(cls, volume: Volume, component: int) -> FinestVoxels:
+        """Returns those of a volume."""
+        values = to_numpy(volume.data[..., component])
 
+        def read(low: Sequence[int], high: Sequence[int]) -> Tensor:
+            start, stop = boxes.clamped_box(low, high, values.shape)
+            part = values[boxes.index(start, stop)]
+            return torch.from_numpy(boxes.repeat_edges(part, start, low, high))
 
-class VolumeField:
-    """One number of a volume's voxels."""
-
-    slab_side = 256
-
-    def __init__(self, volume: Volume, component: int) -> None:
-        self._values = to_numpy(volume.data[..., component])
-        z, y, x = self._values.shape
-        self.shape = (z, y, x)
-
-    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """See `FinestVoxels`."""
-        start, stop = boxes.clamped_box(low, high, self.shape)
-        part = self._values[boxes.index(start, stop)]
-        return torch.from_numpy(boxes.repeat_edges(part, start, low, high))
+        return cls(values.shape, 256, read)
 
 
 def write_colors(
@@ -127,7 +124,7 @@ def _sums_along(
             coarse[level] = torch.zeros((2, painter.width + 1, *counts), **float32)
     for a, b, tile_values in _tiles(field, column_axis, tile):
         values = tile_values.to(device).to(torch.float32)
-        empty = not _is_visible(values, painter.table)
+        empty = bool(Transfer(painter.table).transparent(*values.aminmax()))
         if empty:  # the fewest intervals that make up a voxel of level 0
             shape = (2 * branching, *(2 * n - 4 for n in tile_values.shape[1:]))
             color = torch.zeros((painter.width - 1, *shape), **float32)
@@ -205,16 +202,6 @@ def _tiles(field: FinestVoxels, column_axis: int, tile: int) -> Iterator[tuple[i
         _, *sizes = values.shape
         for a, b in itertools.product(*(range(0, size - 2, tile) for size in sizes)):
             yield corner[0] + a, corner[1] + b, values[:, a : a + tile + 2, b : b + tile + 2]
-
-
-def _is_visible(values: Tensor, table: ColorTable) -> bool:
-    """Returns whether any value between a part's smallest and largest has an opacity."""
-    last = len(table.opaque_m) - 1
-    low, high = table.domain_2.tolist()
-    row_positions = (torch.stack(values.aminmax()) - low) * (last / (high - low))
-    first_row, last_row = (int(row) for row in row_positions.clamp(0, last).tolist())
-    visible_counts = table.opaque_m[[max(first_row - 1, 0), min(last_row + 1, last)]].tolist()
-    return visible_counts[1] > (visible_counts[0] if first_row > 0 else 0)
 
 
 def _upsampled(values: Tensor, slope_axis: int | None = None) -> Tensor:

@@ -34,14 +34,12 @@ from ..io.stores.coarse import make_channel
 from ..io.stores.store import Store
 from ..io.stores.store_layout import CoarseChannel
 from ..ops import ShadeArguments, cut_bricks
-from ..ops.reference.shaders import shader_number
 from ..ops.reference.stored_color import FilteredNumbers
 from ..ops.shading import COLOR_WIDTH, LIT_COLOR_WIDTH, ShadeParameters, channel_widths
 from ..pool import Channel, N3Tree
 from .built_in import Lit
 from .coarse_colors import (
     FinestVoxels,
-    VolumeField,
     mean_of_directions,
     without_light,
     write_colors,
@@ -49,12 +47,12 @@ from .coarse_colors import (
 from .shader import Sampling, Shader, check_width
 from .transfer_function import TransferFunction
 
-#: Results of `finer`: how many times finer than for other shaders levels are chosen. Fitted: the
-#: finest voxels are not filtered, so the sharper their detail, the smaller the pixels must be that
-#: are drawn from them, and the smaller this factor.
+#: Results of `finer`, fitted. With a larger factor the finest voxels, which are not filtered, are
+#: drawn in larger pixels, too; so it is smaller where they hold sharper detail: normals, walls.
 _FINER, _FINER_LIT, _FINER_BY_DIRECTION = 2.0, 1.75, 1.6
 _OPAQUE_ALPHA = 0.2  # colours are stored by direction if a finest voxel can have a higher alpha
 _TIMEOUT = 3600.0  # seconds for one read of local data
+_SLAB_SIDE = 64  # voxels of a store's slabs: the side of its chunks
 _BATCH_BRICKS = 4096  # bricks cut at a time
 
 
@@ -83,8 +81,6 @@ class Filtered(Shader):
     times as fine for lit matter, 1.6 times where colours differ by direction.
     """
 
-    kind = "Filtered"
-    lit_kind = "FilteredLit"  # of a `Lit`
     reads_coarse = True
     transfer: TransferFunction | Lit
     checks: ClassVar[Mapping[str, Check]] = {
@@ -207,9 +203,13 @@ class Filtered(Shader):
         color_channel, made_of = shader.colors(opened.spacing), shader.made_of
         voxel_width = len(DIRECTIONS) * (shader.numbers + 1)  # see `write_colors`
 
+        def read(low: Sequence[int], high: Sequence[int]) -> Tensor:
+            values = opened.read_region(0, low, high, timeout=_TIMEOUT)[..., component]
+            return torch.from_numpy(np.ascontiguousarray(values))
+
         def fill(levels: Sequence[np.ndarray]) -> None:
             out = [torch.from_numpy(level) for level in levels]
-            field = _StoreField(opened, component)
+            field = FinestVoxels(opened.extent[::-1], _SLAB_SIDE, read)
             shader.write(field, opened.spacing, 2, out, torch_device, progress)
 
         def keep(colors: np.ndarray) -> np.ndarray:
@@ -250,6 +250,10 @@ class Filtered(Shader):
             raise ValueError(f"{opened.location}: damaged: {channel!r}: {error}") from None
         shader = Lit(transfer) if lit else transfer
         return cls(shader, channel, component, directions=coarse.width != numbers)
+
+    @property
+    def kind(self) -> str:  # type: ignore[override]
+        return "FilteredLit" if isinstance(self.transfer, Lit) else "Filtered"
 
     @property
     def function(self) -> TransferFunction:
@@ -295,7 +299,7 @@ class Filtered(Shader):
         """Computes the colours of a volume's coarse levels on a device, see `of`, and yields them,
         finest level first, as (z, y, x, width) float16 on the CPU. The width is that of `colors`.
         """
-        field = VolumeField(volume, self.component or 0)
+        field = FinestVoxels.of(volume, self.component or 0)
         sides = [branching ** (level + 1) for level in range(depth)]
         shapes = [[-(-n // side) for n in field.shape] for side in sides]
         voxel_width = len(DIRECTIONS) * (self.numbers + 1)  # see `write_colors`
@@ -357,23 +361,4 @@ class Filtered(Shader):
             raise ValueError(f"{context}: {made}, or it was edited: {hint}")
         widths = channel_widths(self.numbers)
         check_width(f"{context}: filtered colours need", tree, self.other, *widths)
-        arguments = super().shading(context, tree)
-        if arguments is None or self.numbers == COLOR_WIDTH:
-            return arguments
-        return arguments._replace(shader=shader_number(self.lit_kind))
-
-
-class _StoreField:
-    """One number of the finest voxels of a store."""
-
-    slab_side = 64  # the side of its chunks
-
-    def __init__(self, store: Store, component: int) -> None:
-        self._store, self._component = store, component
-        x, y, z = store.extent
-        self.shape = (z, y, x)
-
-    def read(self, low: Sequence[int], high: Sequence[int]) -> Tensor:
-        """See `FinestVoxels`."""
-        values = self._store.read_region(0, low, high, timeout=_TIMEOUT)[..., self._component]
-        return torch.from_numpy(np.ascontiguousarray(values))
+        return super().shading(context, tree)

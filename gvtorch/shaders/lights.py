@@ -18,7 +18,6 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, Checked, class_name, instance_of, whole_between
 from ..ops import ShadeArguments
-from ..ops.reference.shaders import shader_number
 from ..ops.shading import LightKind, Number, ShadeParameters, Triple
 from ..pool import N3Tree
 from .shader import Shader
@@ -158,11 +157,11 @@ class LitShader(Shader):
     Attributes:
         shadows: Whether a cone is traced from each sample to the light: matter along it dims
             diffuse light and highlight. A `Headlight` casts no shadows.
-        shadowed_kind: Its `kind` with shadows; None: it does not support shadows.
+        takes_shadows: Whether its kernel supports shadows, and octaves of scattering.
     """
 
     shadows = False
-    shadowed_kind: str | None = None
+    takes_shadows = False
     checks: ClassVar[Mapping[str, Check]] = {
         "light": instance_of(Headlight, DirectionalLight, PointLight),
         **dict.fromkeys(_MATERIAL[:4], a_number(low=0)),
@@ -210,16 +209,13 @@ class LitShader(Shader):
         return self.light.parameters()._replace(**{name: getattr(self, name) for name in _MATERIAL})
 
     def shading(self, context: str, tree: N3Tree) -> ShadeArguments | None:
-        arguments = super().shading(context, tree)
-        if arguments is None or not (self.shadows or self.octaves):
-            return arguments
-        if self.octaves or self.shadowed_kind is None:
+        if self.octaves or (self.shadows and not self.takes_shadows):
             self.check_scattering(context)
-        return arguments._replace(shader=shader_number(str(self.shadowed_kind)))
+        return super().shading(context, tree)
 
     def check_scattering(self, context: str) -> None:
         """Raises ValueError if the shader or its light does not support `octaves`."""
-        if self.shadowed_kind is None:
+        if not self.takes_shadows:
             raise ValueError(f"{context}: shadows per sample are for Lit and StoredColor")
         if isinstance(self.light, Headlight):
             raise ValueError(f"{context}: octaves of scattering need a sun or lamp, no Headlight")

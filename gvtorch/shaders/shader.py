@@ -167,8 +167,8 @@ class Shader(Checked):
         return tuple(n for n in (self.channel, self.normals, self.other) if n is not None)
 
     def finer(self, tree: N3Tree) -> float:
-        """Returns the factor by which the shader wants levels finer than the pixel cone asks for;
-        to get them, the tracer counts voxels as that many times larger.
+        """Returns by what factor voxels must be smaller than the pixel cone: with 2, levels are
+        chosen as if pixels were half as wide.
         """
         return 1.0
 

@@ -49,7 +49,7 @@ _STATE_FIELDS = {  # fields that a part of a saved state sets too
 
 def _shader_help() -> str:
     """Returns what each shader shows; equal texts in a row are told once."""
-    texts = declared_texts("shaders.built_in", "HELP")
+    texts = declared_texts("shaders.built_in", "BY_NAME")
     parts = [", ".join(names) + f": {text}" for text, names in groupby(texts, texts.__getitem__)]
     return "; ".join(
         (
@@ -143,11 +143,11 @@ class Look:
     def _accumulates(self) -> bool:
         """Whether colours add up along a ray, until its alpha reaches --stop-alpha."""
         from ..shaders import TransferFunction
-        from ..shaders.built_in import BY_NAME
+        from ..shaders.built_in import BY_NAME, named_shader
 
         if self.shader not in BY_NAME:
             return True
-        shader = BY_NAME[self.shader](TransferFunction([(0, 1)]), 0.0)
+        shader = named_shader(self.shader, TransferFunction([(0, 1)]))
         return shader.projection is None and shader.cut_surface() is None
 
     def files(self) -> dict[str, str | None]:
@@ -211,7 +211,7 @@ class Look:
         stretched over the data; `Labels` for data that holds labels.
         """
         from ..shaders import Filtered, Labels, Lit, TransferFunction
-        from ..shaders.built_in import BY_NAME
+        from ..shaders.built_in import named_shader
 
         if self.shader == "channels":
             self.refuse_flags("it takes --channel", "component")
@@ -231,13 +231,13 @@ class Look:
                 if value is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
             data.info.check_component("--component", self.component, data.width)
-            return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
+            return named_shader(self.shader, TransferFunction([(0, 1)]), self.value or 0.0)
         _warn_of_other_channels(data, self.component)
         transfer = parse_transfer(self.tf, self.window, data, self.component)
         if self.shader in ("filtered", "filtered-lit"):  # its colours are made with the tree
             lit_or_plain = Lit(transfer) if self.shader == "filtered-lit" else transfer
             return Filtered(lit_or_plain, component=self.component)
-        return BY_NAME[self.shader](transfer, 0.0)
+        return named_shader(self.shader, transfer)
 
 
 def _warn_of_other_channels(data: Volume | Store, component: int) -> None:

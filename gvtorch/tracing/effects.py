@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from ..base.records import Hits, Rays
+from ..ops.reference.march import Transfer
 from ..ops.shading import pack
-from ..shaders.shader import CutSurface, Shader, row_and_fraction
+from ..shaders.shader import CutSurface, Shader
 from .clip import Clipped
 from .composite import TraceRays, box_span, tree_span
 from .lighting import Lighted
@@ -193,8 +194,9 @@ def _project_pieces(tracer: Tracer, pieces: Iterable[Rays]) -> Hits:
     seen = depth < torch.inf
     value = torch.where(seen, value, 0)
     light = rays[0].light().to(depth)
+    color = Transfer(tracer.arguments).look_up(value[:, 0])[:, :3]
     return Hits(
-        color=torch.where(seen, light * _table_color(tracer, value), 0),
+        color=torch.where(seen, light * color, 0),
         alpha=torch.where(seen, 1, 1 - light),
         depth=depth,
         samples=torch.stack([h.samples for h in hits]).sum(0, dtype=torch.int32),
@@ -210,13 +212,3 @@ def _length_inside(tracer: Tracer, rays: Rays) -> Tensor:
     enter, leave = tree_span(tracer.tree.place, tree_rays.origin, tree_rays.direction)
     first, last = rays.range.unbind(1)
     return (torch.minimum(last, leave) - torch.maximum(first, enter)).clamp(min=0)
-
-
-def _table_color(tracer: Tracer, value: Tensor) -> Tensor:
-    """Returns (r, 3) the transfer function's colours of values (r, 1), read from its table."""
-    table = tracer.arguments.table_lm4[0, :, :3]  # (m, 3), evenly spaced
-    low, high = tracer.arguments.domain_2.unbind(0)
-    position = (value - low) / (high - low) * (len(table) - 1)
-    row, fraction = row_and_fraction(position, len(table))
-    a, b = (table[(row + k)[:, 0]] for k in (0, 1))
-    return a + fraction * (b - a)

@@ -23,7 +23,8 @@ from .composite import TraceRays, join_hits, merged, nothing_like, over, reaches
 from .effects import TreeTrace, box_spans
 from .tracer import Batch
 
-#: Parts of a stretch where trees overlap, front to back: ended rays request nothing behind.
+#: Where trees overlap, a stretch of rays is traced in so many parts, front to back: rays that have
+#: ended request nothing behind.
 _PARTS_PER_STRETCH = 8
 _RAYS_PER_BLOCK = {"cpu": 1 << 14, "cuda": 1 << 18}  # composited by sample at once
 _SLIVER_STEPS = 1e-3  # steps: ends of intervals that are closer count as one

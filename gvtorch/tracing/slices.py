@@ -41,7 +41,7 @@ _RADIOLOGICAL_PLANES = {
     "A": ("coronal", "S", "R"),
     "R": ("sagittal", "S", "A"),
 }
-_GAP = 4  # pixels between the three planes
+GAP = 4  # pixels between planes that are shown together
 
 
 def slice_picture(
@@ -146,8 +146,8 @@ def _views(
 def _arranged(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Joins three planes: those across y and x, side by side, above the one across z."""
     (top, left), (bottom, right) = y.shape[:2], (z.shape[0], x.shape[1])
-    image = np.zeros((top + _GAP + bottom, left + _GAP + right, 3), np.float32)
-    image[:top, :left], image[:top, left + _GAP :], image[top + _GAP :, :left] = y, x, z
+    image = np.zeros((top + GAP + bottom, left + GAP + right, 3), np.float32)
+    image[:top, :left], image[:top, left + GAP :], image[top + GAP :, :left] = y, x, z
     return image
 
 

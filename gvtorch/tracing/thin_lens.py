@@ -22,9 +22,10 @@ from ..base.records import Hits, Rays
 from ..cameras.poses import Coordinates
 from .composite import TraceRays, trace_pieces
 
-#: Width of the cone over the diameter of the circle of confusion. Voxels half as wide as the
-#: circle, read trilinearly, blur as much as it does (variance v^2 / 4; the circle's is 1 / 16).
-#: Fitted, and below 1 / 2: the pixel's cone is added, and blurred density makes opaque things grow.
+#: Width of the lens's cone over the diameter d of the circle of confusion. Trilinear voxels of
+#: side v blur with a variance of v^2 / 4, a disc with d^2 / 16, so v = d / 2 would blur as much.
+#: The fitted value is smaller: the pixel's cone is added, and blurred density makes opaque things
+#: grow.
 _CONE_OF_LENS = 0.3
 
 

@@ -58,7 +58,7 @@ class Tracer:
         self.pose = pose_alone("render", options.pose)
         if frame_1 is None:
             frame_1 = torch.full((1,), tree.frame, dtype=torch.int32, device=tree.device)
-        scale = options.cone_scale * tree.flatness if options.lod == "auto" else 0.0
+        scale = options.cone_scale * tree.isotropy if options.lod == "auto" else 0.0
         sampling = Sampling(
             smallest_spacing=min(tree.spacing),
             step=step,
@@ -74,7 +74,7 @@ class Tracer:
             branching=tree.branching,
             max_depth=tree.depth,
             border=tree.bricks.border,
-            root_voxel=tree.root_voxel * shader.finer(tree),
+            root_voxel=tree.root_voxel * shader.finer(tree),  # voxels taken for larger are refined
             cone_scale=scale,
             step=step,
             bricks_bzyxc=tree.bricks.bricks[channel],

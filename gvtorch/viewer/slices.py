@@ -22,10 +22,9 @@ from ..io.window import window
 from ..pictures import Picture
 from ..shaders import Labels, Shader
 from ..tracing import slice_picture
-from ..tracing.slices import UP, PlaneView, radiological_views
+from ..tracing.slices import GAP, UP, PlaneView, radiological_views
 from .state import ViewState, transfer_of
 
-GAP = 4  # pixels between the four parts
 _CACHED_PLANES = 48  # planes in the cache
 _BACKGROUND = 0.004  # linear light where there is no plane
 

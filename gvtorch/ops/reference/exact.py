@@ -20,9 +20,11 @@ def clamp(value: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
 
 
 def divide(a: Tensor | float, b: Tensor | float, like: Tensor) -> Tensor:
-    """Returns a / b, rounded once. Given a number, torch itself multiplies by a reciprocal."""
-    a, b = (torch.as_tensor(n, dtype=like.dtype, device=like.device) for n in (a, b))
-    return torch.div(a, b.expand(like.shape))
+    """Returns a / b, rounded once. Given a number, torch itself multiplies by a reciprocal. Never
+    blocks.
+    """
+    a, b = (n if isinstance(n, Tensor) else torch.full_like(like, n) for n in (a, b))
+    return torch.div(a.to(like), b.to(like).expand(like.shape))
 
 
 def smaller(a: Tensor, b: Tensor) -> Tensor:

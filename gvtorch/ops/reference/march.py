@@ -172,8 +172,10 @@ class ShadeSum:
 class Transfer:
     """The transfer function: rows at even distances over a domain; see `TraceArguments`."""
 
-    def __init__(self, args: TraceArguments) -> None:
-        self.table_lm4, self.domain_2, self.opaque_m = args.table_lm4, args.domain_2, args.opaque_m
+    def __init__(self, table: Any) -> None:
+        """Takes `TraceArguments`, or a shader's table, whose fields have the same names."""
+        self.table_lm4, self.domain_2 = table.table_lm4, table.domain_2
+        self.opaque_m = table.opaque_m
         self.low: Tensor | float
         self.scale: Tensor | float  # table rows per unit of the value
         self.low, high = self.domain_2.unbind(0)
