@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
+from ..base.lasting import lasting
 
 #: One value per point (...,), several (..., c), or these by channel.
 Values = Tensor | Mapping[str, Tensor]
@@ -139,6 +140,7 @@ class Field(nn.Module):
         triple = check.triple(type(self).__name__, name, value, positive=positive)
         return self._register(name, triple)
 
+    @lasting
     def _register(self, name: str, value: Any) -> Tensor:
         buffer = torch.tensor(value, dtype=torch.float64, device="cpu")
         self.register_buffer(name, buffer)

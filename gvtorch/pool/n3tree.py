@@ -141,6 +141,7 @@ class N3Tree:
         return self.nodes.nbytes + self.bricks.nbytes
 
     @property
+    @lasting
     def place(self) -> Tensor:
         """(3, 3) float64 by which kernels transform rays into tree units: the scene's low corner in
         the world, the world size of the root cube, the scene's high corner in tree units.
