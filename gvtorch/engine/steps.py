@@ -116,6 +116,7 @@ class FrameSteps:
             self._recent_stats.append(stats)
         self.production.failures.raise_if_strict()
 
+    @lasting
     def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
         """Serves the requests of the last frame and writes answers that came late.
 

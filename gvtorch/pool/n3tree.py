@@ -328,6 +328,7 @@ class N3Tree:
         volume.filter = self.filters.get(name, "mean")
         return volume
 
+    @lasting
     @torch.no_grad()
     def refresh(self, box: Sequence[Sequence[float]] | Tensor | None = None) -> None:
         """Recomputes borders, coarse levels, regions and ranges after the finest bricks were edited
