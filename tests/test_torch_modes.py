@@ -9,6 +9,7 @@ import math
 import pytest
 import torch
 from helpers.pictures import GRAY, camera
+from torch.autograd import forward_ad
 
 import gvtorch as gv
 
@@ -128,3 +129,112 @@ def test_a_module_shader_trains_under_autocast(tree, dtype):
     assert torch.allclose(color, expected, atol=0.02) and not torch.equal(color, expected)
     color.sum().backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in module.parameters())
+
+
+class Smooth(torch.nn.Module):
+    """A module with smooth slopes: for differences."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.tensor([[0.3, -0.2, 0.5, -1.0]]).double())
+
+    def forward(self, values, positions, directions, lengths):
+        out = (values @ self.weight.to(values)).sigmoid()
+        return out[:, :3], 1 - torch.exp(-0.3 * out[:, 3:] * lengths)
+
+
+def fine_rays(tree: gv.N3Tree) -> gv.Rays:
+    return camera(3, distance=1.3).placed(tree.box).rays()
+
+
+def test_transforms_of_torch_func_give_the_gradients_of_autograd(tree):
+    """By parameters and by voxels; and what is cached inside serves after them."""
+    view, shader = camera(3, distance=1.3), gv.ModuleShader(Smooth())
+
+    class Traced(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.shader = shader
+
+        def forward(self):
+            return gv.render(tree, view, self.shader, dtype=torch.float64, stop_alpha=1.0).color
+
+    def loss(parameters, voxels):
+        tree.bricks["value"] = voxels
+        return torch.func.functional_call(Traced(), parameters, ()).square().sum()
+
+    parameters = dict(Traced().named_parameters())
+    values = {name: value.detach() for name, value in parameters.items()}
+    (second,) = torch.func.hessian(loss)(values, tree.bricks["value"]).values()
+    assert all(matrix.isfinite().all() and matrix.abs().max() > 0 for matrix in second.values())
+    voxels = tree.bricks["value"].clone().requires_grad_()
+    expected = torch.autograd.grad(loss(parameters, voxels), [*parameters.values(), voxels])
+    by_parameters, by_voxels = torch.func.grad(loss, argnums=(0, 1))(values, voxels.detach())
+    for got, right in zip([*by_parameters.values(), by_voxels], expected, strict=True):
+        torch.testing.assert_close(got, right, rtol=1e-6, atol=1e-9)
+    moves = {name: torch.ones_like(value) for name, value in values.items()}
+    turned = torch.cos(torch.arange(voxels.numel()).double()).view(voxels.shape).float()
+    _, slope = torch.func.jvp(loss, (values, voxels.detach()), (moves, turned))
+    total = sum((g * m).sum() for g, m in zip(expected[:-1], moves.values(), strict=True))
+    torch.testing.assert_close(slope, total + (expected[-1].double() * turned).sum())
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("shader", [GRAY, gv.Lit(GRAY)], ids=["plain", "lit"])
+def test_gradients_of_forward_mode_raise_where_they_would_be_lost(tree, shader):
+    """torch drops them silently where an op has none."""
+    rays = fine_rays(tree)
+    tracer, columns = gv.TreeTracer(tree, shader), tracer_columns(rays)
+    moved = torch.ones_like(rays.origin)
+    with pytest.raises(RuntimeError, match="gradients by origin_r3 would be lost"):
+        torch.func.jvp(lambda o: tracer(o, *columns[1:])[0], (columns[0],), (moved,))
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(columns[0], moved)
+        for trace in (tracer, torch.jit.script(tracer)):
+            with pytest.raises(RuntimeError, match="gradients by origin_r3 would be lost"):
+                trace(dual, *columns[1:])
+        assert tracer(dual.detach(), *columns[1:])[0].shape == (9, 3)
+        voxels = tree.bricks["value"]
+        tree.bricks["value"] = forward_ad.make_dual(voxels, torch.ones_like(voxels))
+        for backend in ("cpp", "reference"):
+            with pytest.raises(RuntimeError, match="gradients by bricks_bzyxc would be lost"):
+                gv.trace(tree, rays, shader, backend=backend)
+        with pytest.raises(RuntimeError, match="backend must be auto or reference"):
+            gv.trace(tree, rays, learned(), backend="cpp")
+
+
+def tracer_columns(rays: gv.Rays) -> list[torch.Tensor]:
+    return [rays.origin, rays.direction, rays.cone, rays.range]
+
+
+@pytest.fixture
+def deterministic():
+    count = torch.get_num_threads()
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+    torch.set_num_threads(count)
+
+
+@pytest.mark.backend("cpp")
+def test_gradients_by_voxels_are_deterministic_where_torch_asks_for_that(tree, deterministic):
+    """The op's backward adds up in whatever order threads come, so the twin is differentiated."""
+    shader, view = learned(), camera(32, distance=1.3)
+    pool = tree.bricks["value"].requires_grad_()
+
+    def gradient(backend: str) -> torch.Tensor:
+        pool.grad = None
+        gv.render(tree, view, shader, backend=backend).color.sum().backward()
+        return pool.grad
+
+    expected = gradient("auto")
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        assert torch.equal(gradient("auto"), expected)
+    with pytest.raises(RuntimeError, match="not deterministic: backend must be auto or reference"):
+        gradient("cpp")
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    with pytest.warns(UserWarning, match="not deterministic"):
+        gradient("cpp")
+    torch.use_deterministic_algorithms(False)
+    assert torch.allclose(gradient("cpp"), expected, atol=1e-5)

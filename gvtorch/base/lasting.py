@@ -1,4 +1,4 @@
-"""`lasting`: for functions that make what later calls read or write."""
+"""`lasting` and `without_autocast`: for what must not depend on the modes in which it is called."""
 
 from __future__ import annotations
 
@@ -13,25 +13,60 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def lasting(function: Function) -> Function:
-    """Makes what a function returns or keeps independent of two modes in which it may be called.
+    """Makes what a function allocates usable by later calls, in whatever mode it is called:
 
-    In `torch.inference_mode` it allocates normal tensors, without gradients: torch lets nobody
-    write inference tensors once that mode has ended, nor save them for a backward pass. Autocast is
-    off within, so that nothing that is kept has fewer digits, or other bits, where it was on.
+    - In `torch.inference_mode` it allocates normal tensors, without gradients. torch lets nobody
+      write inference tensors once that mode has ended, nor save them for a backward pass.
+    - In a transform of `torch.func`, such as `grad`, it runs outside of it: tensors made inside are
+      useless once the transform has ended.
+    - Autocast is off, so that nothing that is kept depends on it.
     """
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        inference = torch.is_inference_mode_enabled()
-        casting = [name for name in ("cpu", "cuda") if torch.is_autocast_enabled(name)]
-        if not inference and not casting:
+        inference, transform = torch.is_inference_mode_enabled(), _in_transform()
+        casting = _casting()
+        if not (inference or transform or casting):
             return function(*args, **kwargs)
         with ExitStack() as modes:
             if inference:
                 modes.enter_context(torch.inference_mode(False))
                 modes.enter_context(torch.no_grad())
-            for name in casting:
-                modes.enter_context(torch.autocast(name, enabled=False))
+            if transform:
+                from torch._functorch import pyfunctorch  # loaded by these transforms
+
+                modes.enter_context(pyfunctorch.temporarily_clear_interpreter_stack())
+            _stop(casting, modes)
             return function(*args, **kwargs)
 
     return cast("Function", run)
+
+
+def without_autocast(function: Function) -> Function:
+    """Makes a function run with autocast off: what it computes has its full digits."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        casting = _casting()
+        if not casting:
+            return function(*args, **kwargs)
+        with ExitStack() as modes:
+            _stop(casting, modes)
+            return function(*args, **kwargs)
+
+    return cast("Function", run)
+
+
+def _in_transform() -> bool:
+    return (
+        not torch.compiler.is_compiling() and torch._C._functorch.maybe_current_level() is not None
+    )
+
+
+def _casting() -> list[str]:
+    return [name for name in ("cpu", "cuda") if torch.is_autocast_enabled(name)]
+
+
+def _stop(casting: list[str], modes: ExitStack) -> None:
+    for name in casting:
+        modes.enter_context(torch.autocast(name, enabled=False))

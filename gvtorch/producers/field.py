@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.check import extent_in, extent_of
 from ..base.constants import DEEP_VOXELS
-from ..base.lasting import lasting
+from ..base.lasting import without_autocast
 from ..base.messages import with_type
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
@@ -312,7 +312,7 @@ def moving_nodes(
     return moves
 
 
-@lasting
+@without_autocast
 def _call_field(context: str, field: nn.Module, method: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a method of a field; if it fails, raises a ValueError of one line, naming the field."""
     try:

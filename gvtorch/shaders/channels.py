@@ -12,6 +12,7 @@ import torch
 
 from ..base import check
 from ..base.image_info import COLORS, ChannelInfo, array_from_srgb, to_hex
+from ..base.lasting import lasting
 from ..base.volume import Volume
 from ..io.stores.store import Store
 from ..io.window import windows
@@ -198,6 +199,7 @@ class Channels(Shader):
         """The highest index that it reads from a voxel: the op checks that voxels have it."""
         return max((component for component, _ in self._visible_functions()), default=0)
 
+    @lasting
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the header and the rows of all channels, see csrc/shaders/channels.h."""
         functions = self._visible_functions()
