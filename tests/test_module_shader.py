@@ -220,6 +220,26 @@ def test_gradients_reach_parameters_and_voxels(blobs, compiled):
         assert abs(slope) > 1e-2 and abs(float(grad.view(-1)[index]) - slope) < 0.02 * abs(slope)
 
 
+def test_a_loss_can_be_taken_backward_where_no_ray_has_a_sample(blobs):
+    """Then gradients are 0: a batch of rays may miss, and DDP waits for all parameters."""
+    tree, view = gv.N3Tree.from_volume(blobs, 8), gv.Camera.orbit(width=4, height=4, distance=1.3)
+    shader = gv.ModuleShader(gv.TransferModule(SOFT, min(tree.spacing)))
+    pool = tree.bricks["value"].requires_grad_()
+    rays = view.placed(tree.box).rays()
+    behind = dataclasses.replace(rays, origin=rays.origin + 1e3 * rays.direction)
+    for scene in (tree, {"a": tree, "b": tree}):
+        for missing in (behind, rays[:0]):
+            hits = gv.trace(scene, missing, shader)
+            for field in (hits.color, hits.alpha):
+                leaves = [shader.module.rows, pool]
+                grads = torch.autograd.grad(field.sum(), leaves, retain_graph=True)
+                assert [grad.shape for grad in grads] == [leaf.shape for leaf in leaves]
+                assert not any(grad.any() for grad in grads)
+            assert not hits.color.any()
+        with torch.no_grad():
+            assert not gv.trace(scene, behind, shader).color.requires_grad
+
+
 @torch.no_grad()
 def test_rays_that_have_ended_mark_and_request_nothing(blobs, compiled):
     device = DEVICES[compiled]

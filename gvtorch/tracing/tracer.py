@@ -99,6 +99,14 @@ class Tracer:
         args = self.arguments
         return Tracer(self.tree, shader, options, by_level=args.by_level, frame_1=args.frame_1)
 
+    def learned(self) -> list[Tensor]:
+        """Returns the parameters and voxels by which a module shader gives gradients."""
+        if not isinstance(self.shader, ModuleShader):
+            return []
+        names, bricks = self.shader.channels or (self.channel,), self.tree.bricks.bricks
+        tensors = (*self.shader.parameters(), *(bricks[name] for name in names))
+        return [tensor for tensor in tensors if tensor.requires_grad]
+
     def to_tree(self, rays: Rays) -> Rays:
         """Returns world rays in the tree's axes."""
         return rays if self.pose is None else self.pose.to_tree(rays)
