@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -240,6 +241,34 @@ def test_a_brick_that_a_field_can_not_make_is_one_line():
             engine.render(camera(24), GRAY)
         assert str(caught.value).endswith(TORN) and str(engine.failures[0]).endswith(TORN)
     assert isinstance(caught.value.__cause__.__cause__, RuntimeError)
+
+
+@pytest.mark.parametrize("layer", [torch.nn.BatchNorm1d(3), torch.nn.Dropout(0.5)])
+def test_a_network_in_training_mode_is_refused_and_left_as_it_is(layer):
+    """Its values would depend on which voxels are computed together, or on chance."""
+
+    class Network(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = copy.deepcopy(layer)
+
+        def forward(self, points):
+            return self.layer(points.reshape(-1, 3)).sum(1).sigmoid().view(points.shape[:-1])
+
+    network = Network()
+    state = copy.deepcopy(network.state_dict())
+    producer = gv.FieldProducer(network, 16, box=BOX)
+    assert network.layer.training and str(network.state_dict()) == str(state)
+    name = type(layer).__name__
+    with pytest.raises(gv.ProductionError, match=f"holds a {name} in training mode.* call eval"):
+        gv.Engine(producer)
+    network.eval()
+    with gv.Engine(producer) as engine:
+        assert engine.render(camera(4, distance=1.3), GRAY).stats.failed == 0
+        network.train()
+        engine.render(camera(24, distance=1.3), GRAY)
+        assert "call eval" in str(engine.failures[0])
+    assert str(network.state_dict()) == str(state)
 
 
 @pytest.mark.backend("cpp")

@@ -12,6 +12,7 @@ from helpers.pictures import GRAY, camera
 from torch.autograd import forward_ad
 
 import gvtorch as gv
+from gvtorch.shaders.shader import Sampling
 
 BOX = ((-1, -1, -1), (1, 1, 1))
 
@@ -238,3 +239,46 @@ def test_gradients_by_voxels_are_deterministic_where_torch_asks_for_that(tree, d
         gradient("cpp")
     torch.use_deterministic_algorithms(False)
     assert torch.allclose(gradient("cpp"), expected, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore")  # what dynamo can't follow, it leaves to Python
+def test_a_compiled_function_may_make_the_table_of_a_shader():
+    """dynamo follows NumPy in torch, which counts no bools unless told the dtype."""
+    torch._dynamo.reset()
+    sampling = Sampling(smallest_spacing=1.0, step=0.5)
+    fresh = gv.TransferFunction(GRAY.opacity, GRAY.color)
+
+    def rows() -> torch.Tensor:
+        return fresh.table(sampling).opaque_m
+
+    compiled = torch.compile(rows, backend="eager")
+    expected = GRAY.table(sampling).opaque_m
+    assert torch.equal(compiled(), expected)
+
+
+@pytest.mark.backend("cpp")
+def test_a_net_with_a_tracer_is_trained_by_distributed_data_parallel(tree, tmp_path):
+    """Without broadcasting its buffers, as its docstring says: the requests are 16-bit integers."""
+    view, tracer = camera(4, distance=1.3), gv.TreeTracer(tree, GRAY)
+    assert "broadcast_buffers=False" in gv.TreeTracer.__doc__
+
+    class Net(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.tracer, self.shader, self.tint = tracer, learned(), torch.nn.Linear(3, 3)
+
+        def forward(self):
+            color = gv.render(tree, view, self.shader).color
+            return color + self.tint(self.tracer(*self.tracer.rays(view))[0])
+
+    store = f"file://{tmp_path}/store"
+    torch.distributed.init_process_group("gloo", init_method=store, rank=0, world_size=1)
+    try:
+        net = torch.nn.parallel.DistributedDataParallel(Net(), broadcast_buffers=False)
+        for _ in range(2):
+            net().sum().backward()
+        assert all(parameter.grad.abs().sum() > 0 for parameter in net.parameters())
+        with pytest.raises(RuntimeError, match="Invalid scalar type"):
+            torch.nn.parallel.DistributedDataParallel(Net())
+    finally:
+        torch.distributed.destroy_process_group()

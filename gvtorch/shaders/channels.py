@@ -257,7 +257,7 @@ def _make_table(
             halvings = np.log1p(-rows[:, 3]) * (-length / math.log(2))
         halvings = np.minimum(halvings, _OPAQUE_HALVINGS)
         table[:, row_slice, 3] = halvings * 2.0 ** np.arange(levels)[:, None]
-        opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0)
+        opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0, dtype=np.int32)
         used_rows += len(rows)
     dtype, device = sampling.dtype, sampling.device
     return ColorTable(

@@ -30,7 +30,8 @@ class TreeTracer(torch.nn.Module):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
     moves them. Their dtypes stay as kernels need them, even if `half()`, `bfloat16()` or `double()`
     is called on a net that contains the module. Any number of threads may trace at a time, while
-    none writes into its buffers.
+    none writes into its buffers. `DistributedDataParallel` needs `broadcast_buffers=False`: each
+    process has the pools, and what sends buffers there knows no 16-bit integers.
 
     Buffers and numbers are named after the ops' arguments. Light and material of a lit shader are
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
