@@ -168,6 +168,9 @@ class TreeTracer(torch.nn.Module):
 
         Returns:
             float32 color (..., 3) premultiplied, alpha and depth (..., 1); int32 samples (...).
+
+        Raises:
+            ValueError: A tensor has another shape.
         """
         color, alpha, depth, samples, _, _ = self.hits(origin, direction, cone, range)
         return color, alpha, depth, samples
@@ -180,11 +183,14 @@ class TreeTracer(torch.nn.Module):
         (0, 0) where the shader gives none.
         """
         leading = list(origin.shape[:-1])
-        columns = [
-            column.to(torch.float64).reshape(-1, column.shape[-1]).contiguous()
-            for column in (origin, direction, cone, range)
-        ]
-        rays = RayArguments(columns[0], columns[1], columns[2], columns[3], 0, None)
+        rays = RayArguments(
+            _rows("origin", origin, leading, 3),
+            _rows("direction", direction, leading, 3),
+            _rows("cone", cone, leading, 2),
+            _rows("range", range, leading, 2),
+            0,
+            None,
+        )
         arguments = self.arguments()
         if self.plain:
             color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(*rays, *arguments)
@@ -249,6 +255,14 @@ def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
     child, brick, bricks = pools
     check.integers_in("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
     check.integers_in("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
+
+
+def _rows(name: str, column: Tensor, leading: list[int], width: int) -> Tensor:
+    """Returns a column of rays (..., width) as float64 rows; ValueError for another shape."""
+    shape = leading + [width]  # noqa: RUF005  (TorchScript has no stars here)
+    if list(column.shape) != shape:
+        raise ValueError(f"TreeTracer: {name} must be {shape}, got {list(column.shape)}")
+    return column.to(torch.float64).reshape(-1, width).contiguous()
 
 
 def _unflatten(rows: Tensor, leading: list[int]) -> Tensor:
