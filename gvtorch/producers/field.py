@@ -15,6 +15,7 @@ from ..base.check import extent_in, extent_of
 from ..base.constants import DEEP_VOXELS
 from ..base.lasting import without_autocast
 from ..base.messages import with_type
+from ..base.own_dtypes import OwnDtypes
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
@@ -28,7 +29,7 @@ _TRAINING_DIFFERS = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._Dropou
 _ROUNDING = 2.0**-18  # relative widening of intervals, because values are rounded too
 
 
-class FieldProducer(Producer):
+class FieldProducer(OwnDtypes, Producer):
     """Evaluates a field where rays ask for it: any `Field`, or any module that computes values
     (..., c), or {channel: (..., c)}, from world positions (..., 3).
 

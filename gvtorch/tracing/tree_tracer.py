@@ -6,8 +6,8 @@ archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from ..base import check
 from ..base import constants as config
 from ..base.lasting import lasting
+from ..base.own_dtypes import OwnDtypes
 from ..base.records import Rays
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
@@ -26,7 +27,7 @@ from .options import RenderOptions
 from .tracer import Tracer
 
 
-class TreeTracer(torch.nn.Module):
+class TreeTracer(OwnDtypes):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
     moves them. Their dtypes stay as kernels need them, even if `half()`, `bfloat16()` or `double()`
     is called on a net that contains the module. Any number of threads may trace at a time, while
@@ -103,15 +104,6 @@ class TreeTracer(torch.nn.Module):
 
     def __repr__(self) -> str:
         return f"TreeTracer({self.about})"
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Moves the buffers without changing their dtypes."""
-
-        def convert(tensor: Tensor) -> Tensor:
-            converted = fn(tensor)
-            return converted if converted.dtype == tensor.dtype else tensor.to(converted.device)
-
-        return super()._apply(convert, recurse)
 
     @torch.jit.unused
     def rays(self, camera: Camera | Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
