@@ -180,6 +180,15 @@ def test_transforms_of_torch_func_give_the_gradients_of_autograd(tree):
     torch.testing.assert_close(slope, total + (expected[-1].double() * turned).sum())
 
 
+def test_an_engine_refuses_transforms_of_torch_func(blobs):
+    view = camera(3, distance=1.3)
+    with gv.Engine(gv.VolumeProducer(blobs)) as engine:
+        before = engine.render(view, GRAY).color
+        with pytest.raises(RuntimeError, match="can't transform writes into pools"):
+            torch.func.grad(lambda gain: (gain * engine.render(view, GRAY).color).sum())(before)
+        assert torch.equal(engine.render(view, GRAY).color, before)
+
+
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("shader", [GRAY, gv.Lit(GRAY)], ids=["plain", "lit"])
 def test_gradients_of_forward_mode_raise_where_they_would_be_lost(tree, shader):

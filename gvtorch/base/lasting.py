@@ -24,7 +24,7 @@ def lasting(function: Function) -> Function:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        inference, transform = torch.is_inference_mode_enabled(), _in_transform()
+        inference, transform = torch.is_inference_mode_enabled(), in_transform()
         casting = _casting()
         if not (inference or transform or casting):
             return function(*args, **kwargs)
@@ -57,7 +57,8 @@ def without_autocast(function: Function) -> Function:
     return cast("Function", run)
 
 
-def _in_transform() -> bool:
+def in_transform() -> bool:
+    """Returns whether a transform of `torch.func`, such as `grad` or `vmap`, is running."""
     return (
         not torch.compiler.is_compiling() and torch._C._functorch.maybe_current_level() is not None
     )
