@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import pytest
@@ -240,6 +241,55 @@ def test_a_brick_that_a_field_can_not_make_is_one_line():
             engine.render(camera(24), GRAY)
         assert str(caught.value).endswith(TORN) and str(engine.failures[0]).endswith(TORN)
     assert isinstance(caught.value.__cause__.__cause__, RuntimeError)
+
+
+@pytest.mark.parametrize("change", ["half", "bfloat16", "float", "double"])
+def test_a_net_may_change_its_dtype_around_fields(change):
+    """Shapes stay where they are, in every bit; layers of the net follow."""
+    turned = sdf.rotated(sdf.Box((0.5, 0.3, 0.2)), (0, 0, 1), 0.3)
+
+    def net() -> torch.nn.ModuleDict:
+        producer = gv.FieldProducer(turned - sdf.Sphere(0.3), 18, branching=3)
+        return torch.nn.ModuleDict(
+            {"world": copy.deepcopy(producer), "head": torch.nn.Linear(3, 3)}
+        )
+
+    def picture(producer: gv.Producer) -> torch.Tensor:
+        with gv.Engine(producer) as engine:
+            return engine.render(camera(8, distance=1.3), GRAY).color
+
+    changed = getattr(net(), change)()
+    assert changed["head"].weight.dtype == getattr(torch.ones(1), change)().dtype
+    assert torch.equal(picture(changed["world"]), picture(net()["world"]))
+    assert all(buffer.is_meta for buffer in changed.to("meta").buffers())
+
+
+@pytest.mark.parametrize("layer", [torch.nn.BatchNorm1d(3), torch.nn.Dropout(0.5)])
+def test_a_network_in_training_mode_is_refused_and_left_as_it_is(layer):
+    """Its values would depend on which voxels are computed together, or on chance."""
+
+    class Network(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = copy.deepcopy(layer)
+
+        def forward(self, points):
+            return self.layer(points.reshape(-1, 3)).sum(1).sigmoid().view(points.shape[:-1])
+
+    network = Network()
+    state = copy.deepcopy(network.state_dict())
+    producer = gv.FieldProducer(network, 16, box=BOX)
+    assert network.layer.training and str(network.state_dict()) == str(state)
+    name = type(layer).__name__
+    with pytest.raises(gv.ProductionError, match=f"holds a {name} in training mode.* call eval"):
+        gv.Engine(producer)
+    network.eval()
+    with gv.Engine(producer) as engine:
+        assert engine.render(camera(4, distance=1.3), GRAY).stats.failed == 0
+        network.train()
+        engine.render(camera(24, distance=1.3), GRAY)
+        assert "call eval" in str(engine.failures[0])
+    assert str(network.state_dict()) == str(state)
 
 
 @pytest.mark.backend("cpp")

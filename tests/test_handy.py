@@ -188,6 +188,25 @@ def test_a_tracer_takes_rays_of_any_leading_shape(blobs, shader):
     assert repr(tracer).startswith("TreeTracer(N3Tree(45x29x37") and "\n" not in repr(tracer)
 
 
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize("mode", [lambda tracer: tracer, torch.jit.script], ids=["eager", "script"])
+def test_a_tracer_refuses_columns_that_do_not_fit(blobs, mode):
+    """As many numbers in another shape would be other rays."""
+    tracer = gv.TreeTracer(gv.N3Tree.from_volume(blobs), GRAY)
+    origin, direction, cone, ranges = tracer.rays(camera(6, distance=1.3))
+    run = mode(tracer)
+    turned = direction.reshape(4, 9, 3)
+    for columns, message in (
+        ((origin, turned, cone, ranges), r"direction must be \[6, 6, 3\], got \[4, 9, 3\]"),
+        ((origin, direction, cone.reshape(24, 3), ranges), r"cone must be \[6, 6, 2\]"),
+        ((origin, direction, cone, ranges[0]), r"range must be \[6, 6, 2\]"),
+        ((origin[..., 0], direction, cone, ranges), r"origin must be \[6, 3\], got \[6, 6\]"),
+        ((origin.sum(), direction, cone, ranges), r"origin must be \[3\], got \[\]"),
+    ):
+        with pytest.raises((ValueError, torch.jit.Error), match=message):
+            run(*columns)
+
+
 def test_a_net_that_holds_a_module_shader_has_its_parameters(blobs):
     class Holder(torch.nn.Module):
         def __init__(self) -> None:

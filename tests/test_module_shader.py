@@ -220,6 +220,52 @@ def test_gradients_reach_parameters_and_voxels(blobs, compiled):
         assert abs(slope) > 1e-2 and abs(float(grad.view(-1)[index]) - slope) < 0.02 * abs(slope)
 
 
+def test_bricks_made_of_voxels_by_index_have_their_whole_gradients(blobs):
+    """As docs/custom_shaders.md says; those of the bricks themselves lack the borders' share."""
+    data, view = blobs.data, gv.Camera.orbit(width=5, height=5, distance=1.3)
+    shader = gv.ModuleShader(gv.TransferModule(SOFT, 1.0))
+    options = {"lod": "finest", "dtype": torch.float64, "stop_alpha": 1.0}
+
+    def loss(tree: gv.N3Tree) -> torch.Tensor:
+        return gv.render(tree, view, shader, **options).color.sum()
+
+    count = torch.arange(float(data.numel())).view_as(data)
+    tree, voxels = gv.N3Tree.from_volume(gv.Volume(count)), data.clone().requires_grad_()
+    index = tree.bricks["value"].long()
+    bricks = data.flatten()[index].requires_grad_()
+    tree.bricks["value"] = bricks
+    (by_bricks,) = torch.autograd.grad(loss(tree), bricks)
+    tree.bricks["value"] = voxels.flatten()[index]
+    (by_voxels,) = torch.autograd.grad(loss(tree), voxels)
+    assert by_voxels.sum() == pytest.approx(float(by_bricks.sum()), rel=1e-4)
+    inner = by_bricks[:, 1:-1, 1:-1, 1:-1]
+    assert inner.abs().sum() < 0.95 * by_bricks.abs().sum()
+    move = 1e-3 * by_voxels.sign() * (by_voxels.abs() > 0.1 * by_voxels.abs().max())
+    with torch.no_grad():
+        ends = [loss(gv.N3Tree.from_volume(gv.Volume(data + s * move))) for s in (1, -1)]
+    assert float(ends[0] - ends[1]) / 2 == pytest.approx(float((by_voxels * move).sum()), rel=0.02)
+
+
+def test_a_loss_can_be_taken_backward_where_no_ray_has_a_sample(blobs):
+    """Then gradients are 0: a batch of rays may miss, and DDP waits for all parameters."""
+    tree, view = gv.N3Tree.from_volume(blobs, 8), gv.Camera.orbit(width=4, height=4, distance=1.3)
+    shader = gv.ModuleShader(gv.TransferModule(SOFT, min(tree.spacing)))
+    pool = tree.bricks["value"].requires_grad_()
+    rays = view.placed(tree.box).rays()
+    behind = dataclasses.replace(rays, origin=rays.origin + 1e3 * rays.direction)
+    for scene in (tree, {"a": tree, "b": tree}):
+        for missing in (behind, rays[:0]):
+            hits = gv.trace(scene, missing, shader)
+            for field in (hits.color, hits.alpha):
+                leaves = [shader.module.rows, pool]
+                grads = torch.autograd.grad(field.sum(), leaves, retain_graph=True)
+                assert [grad.shape for grad in grads] == [leaf.shape for leaf in leaves]
+                assert not any(grad.any() for grad in grads)
+            assert not hits.color.any()
+        with torch.no_grad():
+            assert not gv.trace(scene, behind, shader).color.requires_grad
+
+
 @torch.no_grad()
 def test_rays_that_have_ended_mark_and_request_nothing(blobs, compiled):
     device = DEVICES[compiled]

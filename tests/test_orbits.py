@@ -136,6 +136,25 @@ def test_square_roots_are_rounded_once_whoever_follows(dtype):
         torch.testing.assert_close(forward_ad.unpack_dual(sqrt_exact(dual)).tangent, slope)
 
 
+def test_gradients_of_a_fractal_are_the_same_in_both_modes_and_again():
+    """A logarithm computed by hand lost those of forward mode, and second ones."""
+    bulb = gv.Mandelbulb(4)
+    points = torch.rand(6, 3, generator=torch.Generator().manual_seed(1)).double() * 0.5 + 0.1
+    move = torch.linspace(-1, 1, 18).double().view(6, 3)
+
+    def slope(at: torch.Tensor) -> torch.Tensor:
+        return (torch.func.grad(lambda p: bulb(p).sum())(at) * move).sum()
+
+    value, forward = torch.func.jvp(lambda p: bulb(p).sum(), (points,), (move,))
+    ends = [float(bulb(points + h * move).sum()) for h in (1e-6, -1e-6)]
+    assert float(value) == float(bulb(points).sum())
+    assert float(forward) == pytest.approx(float(slope(points)), rel=1e-9)
+    assert float(forward) == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
+    second = float((torch.func.grad(slope)(points) * move).sum())
+    ends = [float(slope(points + h * move)) for h in (1e-6, -1e-6)]
+    assert second == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5)
+
+
 @forms
 def test_gradients_are_those_of_small_steps(form):
     points = some_points(3000, torch.float64, wide(form))[500:]

@@ -101,6 +101,13 @@ WORKERS = """
 """
 
 
+def test_an_engine_says_that_it_is_not_copied(blobs):
+    with gv.Engine(gv.VolumeProducer(blobs)) as engine:
+        for take in (pickle.dumps, copy.copy, copy.deepcopy):
+            with pytest.raises(TypeError, match="Engine: it can't be copied or pickled: make one"):
+                take(engine)
+
+
 @pytest.mark.parametrize(
     ("method", "where"), [("spawn", ["outside"]), ("fork", ["inside", "outside"])]
 )

@@ -20,6 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from .constants import MAX_EXTENT
 from .messages import one_line
@@ -193,16 +194,29 @@ def no_gradient(context: str, name: str, value: Any) -> None:
     Works alike in eager, scripted, compiled and exported programs: ops/registry.py calls it for the
     arguments of ops, other modules call it where values leave torch.
     """
-    if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
+    if isinstance(value, Tensor) and is_recorded(value):
         raise lost_gradient(context, name)
+
+
+def is_recorded(value: Tensor) -> bool:
+    """Returns whether autograd records gradients by a tensor, backward or in forward mode."""
+    return (value.requires_grad and torch.is_grad_enabled()) or has_tangent(value)
+
+
+def has_tangent(value: Tensor) -> bool:
+    """Returns whether autograd tracks a tensor in forward mode, as in `torch.func.jvp`."""
+    return forward_ad._current_level >= 0 and forward_ad.unpack_dual(value).tangent is not None
 
 
 def lost_gradient(context: str, name: str) -> RuntimeError:
     """Returns the error for a gradient that would be lost."""
-    return RuntimeError(
-        f"{context}: gradients by {name} would be lost: only gv.ModuleShader gives gradients, by "
-        "its parameters and by bricks that require them; else take detach() or torch.no_grad()"
+    reason = (
+        "only gv.ModuleShader gives gradients, by its parameters and by bricks that require them; "
+        "else take detach() or torch.no_grad()"
     )
+    if context.endswith("_backward"):
+        reason = "for second derivatives backend must be 'reference'"
+    return RuntimeError(f"{context}: gradients by {name} would be lost: {reason}")
 
 
 def images(context: str, name: str, value: Any, channels: int, *, batch: bool = True) -> None:

@@ -1,9 +1,10 @@
-"""`lasting`: for functions that allocate tensors which later calls write."""
+"""`lasting` and `without_autocast`: for what must not depend on the modes in which it is called."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any, TypeVar, cast
 
 import torch
@@ -12,15 +13,61 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def lasting(function: Function) -> Function:
-    """Makes a function called in `torch.inference_mode` allocate normal tensors, without gradients:
-    torch lets nobody write inference tensors once that mode has ended.
+    """Makes what a function allocates usable by later calls, in whatever mode it is called:
+
+    - In `torch.inference_mode` it allocates normal tensors, without gradients. torch lets nobody
+      write inference tensors once that mode has ended, nor save them for a backward pass.
+    - In a transform of `torch.func`, such as `grad`, it runs outside of it: tensors made inside are
+      useless once the transform has ended.
+    - Autocast is off, so that nothing that is kept depends on it.
     """
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        if not torch.is_inference_mode_enabled():
+        inference, transform = torch.is_inference_mode_enabled(), in_transform()
+        casting = _casting()
+        if not (inference or transform or casting):
             return function(*args, **kwargs)
-        with torch.inference_mode(False), torch.no_grad():
+        with ExitStack() as modes:
+            if inference:
+                modes.enter_context(torch.inference_mode(False))
+                modes.enter_context(torch.no_grad())
+            if transform:
+                from torch._functorch import pyfunctorch  # loaded by these transforms
+
+                modes.enter_context(pyfunctorch.temporarily_clear_interpreter_stack())
+            _stop(casting, modes)
             return function(*args, **kwargs)
 
     return cast("Function", run)
+
+
+def without_autocast(function: Function) -> Function:
+    """Makes a function run with autocast off: what it computes has its full digits."""
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        casting = _casting()
+        if not casting:
+            return function(*args, **kwargs)
+        with ExitStack() as modes:
+            _stop(casting, modes)
+            return function(*args, **kwargs)
+
+    return cast("Function", run)
+
+
+def in_transform() -> bool:
+    """Returns whether a transform of `torch.func`, such as `grad` or `vmap`, is running."""
+    return (
+        not torch.compiler.is_compiling() and torch._C._functorch.maybe_current_level() is not None
+    )
+
+
+def _casting() -> list[str]:
+    return [name for name in ("cpu", "cuda") if torch.is_autocast_enabled(name)]
+
+
+def _stop(casting: list[str], modes: ExitStack) -> None:
+    for name in casting:
+        modes.enter_context(torch.autocast(name, enabled=False))

@@ -351,5 +351,9 @@ class Engine(FrameSteps):
     def __exit__(self, *_error: object) -> None:
         self.close()
 
+    def __reduce__(self) -> Any:
+        hint = "make one in each process, of the producer, which can be pickled"
+        raise TypeError(f"Engine: it can't be copied or pickled: {hint}")
+
     def __repr__(self) -> str:
         return f"Engine({', '.join(self.trees)} on {self.device}, {self.frames} frames)"

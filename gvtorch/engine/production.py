@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..base.constants import REQUEST_LOAD, REQUEST_PENDING_SHIFT, REQUEST_SUBDIVIDE
+from ..base.lasting import lasting
 from ..base.messages import one_line
 from ..base.stage import stage
 from ..cache import KINDS, Cache, RequestList, Scheduler, write
@@ -190,6 +191,7 @@ class Production:
                 free[coarse] = max(0, free[coarse] - sum(map(len, pending)))
         return room
 
+    @lasting
     def serve(self, request_list: RequestList, counts: Counts, stats: FrameStats) -> None:
         """Makes unused slots available, chooses requests, asks the producers, and writes the
         answers that come at once. Recorded frames choose on the device (`RecordedFrame`).

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
-from ..base.lasting import lasting
+from ..base.lasting import in_transform, lasting
 from ..base.records import Hits, add
 from ..base.stage import Progress, collect_timings, mark, milliseconds, no_progress, stage
 from ..cache import Cache, RequestList, Scheduler
@@ -82,6 +82,9 @@ class FrameSteps:
         with self.lock:
             if self._closed:
                 raise ValueError("Engine: it is closed")
+            if in_transform():
+                hint = "render a resident tree in it"
+                raise RuntimeError(f"Engine: torch.func can't transform writes into pools: {hint}")
             if self._rendering:
                 raise RuntimeError("Engine: a frame within a frame: a producer or progress renders")
             self._rendering = True
@@ -116,6 +119,7 @@ class FrameSteps:
             self._recent_stats.append(stats)
         self.production.failures.raise_if_strict()
 
+    @lasting
     def serve_last_frame(self, stats: FrameStats, wait: bool = False) -> None:
         """Serves the requests of the last frame and writes answers that came late.
 

@@ -17,6 +17,8 @@ import torch
 from torch import Tensor, nn
 
 from ..base import check
+from ..base.lasting import lasting
+from ..base.own_dtypes import OwnDtypes
 
 #: One value per point (...,), several (..., c), or these by channel.
 Values = Tensor | Mapping[str, Tensor]
@@ -26,13 +28,14 @@ Interval = tuple[Tensor, Tensor]
 Bounds = Interval | Mapping[str, Interval] | None
 
 
-class Field(nn.Module):
+class Field(OwnDtypes):
     """Base of fields. A subclass implements `forward`, and `bounds` if it can: bricks whose bounds
     prove that they show nothing need not be made.
 
     All methods are pure functions of tensors in torch: no shape depends on values and the host
     never waits, so that they can be compiled and recorded. Numbers that may change between
-    pictures are buffers (see `number` and `vector`), edited in place.
+    pictures are buffers (see `number` and `vector`), edited in place. Buffers keep their dtypes,
+    whatever dtype a net that contains the field is converted to; parameters follow.
 
     Attributes:
         prefiltered: Whether the field can compute means over voxels: `filtered` is then called once
@@ -139,6 +142,7 @@ class Field(nn.Module):
         triple = check.triple(type(self).__name__, name, value, positive=positive)
         return self._register(name, triple)
 
+    @lasting
     def _register(self, name: str, value: Any) -> Tensor:
         buffer = torch.tensor(value, dtype=torch.float64, device="cpu")
         self.register_buffer(name, buffer)

@@ -63,13 +63,20 @@ def choose_backend(backend: str, device: torch.device) -> str:
     return backend
 
 
-def runs_twin(backend: str, *tensors: Tensor) -> bool:
+def runs_twin(backend: str, *tensors: Tensor, has_backward: bool = False) -> bool:
     """Returns whether a call runs the twin: as `backend` says or, for auto, where gradients by its
-    tensors are recorded, since torch can differentiate the twin. Raises as `choose_backend` does.
+    tensors are recorded, since torch can differentiate the twin. If the op itself has a backward,
+    only where that is not enough: in forward mode, and for the transforms of `torch.func`. Raises
+    as `choose_backend` does.
     """
-    needs_gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     chosen = choose_backend(backend, tensors[0].device)
-    return chosen == "reference" or (needs_gradient and backend == "auto")
+    if chosen == "reference" or backend != "auto":
+        return chosen == "reference"
+    recorded = [t for t in tensors if torch.is_grad_enabled() and t.requires_grad]
+    if has_backward:  # compilers see the op as it is
+        is_transformed = torch._C._functorch.is_gradtrackingtensor
+        recorded = [t for t in recorded if not torch.compiler.is_compiling() and is_transformed(t)]
+    return bool(recorded) or any(map(check.has_tangent, tensors))
 
 
 def op(
@@ -187,10 +194,9 @@ def _refuse_gradients(op: Any) -> None:
         _libraries[namespace] = torch.library.Library(namespace, "IMPL")
 
     def kernel(dispatch_keys: Any, *args: Any) -> Any:
-        if torch.is_grad_enabled():
-            for position, value in enumerate(args):
-                if isinstance(value, Tensor) and value.requires_grad:
-                    raise check.lost_gradient(op_name, names[position])
+        for position, value in enumerate(args):
+            if isinstance(value, Tensor) and check.is_recorded(value):
+                raise check.lost_gradient(op_name, names[position])
         return op.default.redispatch(dispatch_keys & torch._C._after_autograd_keyset, *args)
 
     _libraries[namespace].impl(op_name, kernel, "Autograd", with_keyset=True)

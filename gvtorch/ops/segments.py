@@ -5,6 +5,8 @@ last two are differentiable. They raise as those of `trace.py` do.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,7 +15,7 @@ from torch import Tensor
 from ..base import check
 from .arguments import RayArguments, Samples, Segments, TraceArguments
 from .reference import segments as twins
-from .registry import Backend, argument_names, choose_backend, fake_of, unavailable
+from .registry import Backend, argument_names, choose_backend, fake_of, runs_twin, unavailable
 from .trace import check_channel, check_rays, check_real, check_trace, check_voxels
 
 _SEGMENT_BYTES = 84  # at most, in float64
@@ -98,7 +100,10 @@ def sample_bricks(
     backend: Backend = "auto",
 ) -> Tensor:
     """Reads all numbers of a channel at samples: trilinear, two levels blended, in the same bits as
-    `trace_rays` reads one of them. Differentiable by bricks and constants that are floats.
+    `trace_rays` reads one of them. Differentiable by bricks and constants that are floats; the
+    reference also in forward mode and twice. It therefore runs under the transforms of `torch.func`
+    and, if there are gradients, where `torch.use_deterministic_algorithms` is on, if `backend` is
+    auto.
 
     Args:
         rays: The rays that were walked.
@@ -111,9 +116,13 @@ def sample_bricks(
         (k, c) in the segments' dtype.
     """
     context, device = "sample_bricks", rays.origin_r3.device
-    chosen_backend = choose_backend(backend, device)
-    if chosen_backend != "reference":  # the reference also reads float64
+    voxels = (arguments.bricks_bzyxc, arguments.constant_tnc)
+    # The op's backward adds up in whatever order threads come.
+    has_backward = not torch.are_deterministic_algorithms_enabled()
+    is_twin = runs_twin(backend, *voxels, has_backward=has_backward)
+    if not is_twin:  # the reference also reads float64
         check_voxels(context, arguments)
+        _refuse_tangents(context, _DIFFERENTIABLE, voxels)
     check_rays(context, rays)
     check_channel(context, arguments, device)
     check_real(context, "distance", segments.distance, "(s, 3)")
@@ -122,7 +131,7 @@ def sample_bricks(
     shapes = ("s", "s2", "s2", "s3", "s3", "s3", "k", "k")
     dtypes = (*[torch.int32] * 5, segments.distance.dtype, torch.int32, torch.int32)
     check.tensors(context, device, zip(names, tensors, shapes, dtypes, strict=True))
-    if chosen_backend == "reference":
+    if is_twin:
         return twins.sample_bricks(rays, arguments, segments, samples)
     return torch.ops.gvtorch.sample_bricks(*rays, *arguments.channel, *tensors)
 
@@ -137,7 +146,9 @@ def composite(
     backend: Backend = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Composites samples along rays, front to back: a sample's weight is its alpha times the
-    transmittance before it. Differentiable by alpha, features and `clear_r`, also at an alpha of 1.
+    transmittance before it. Differentiable by alpha, features and `clear_r`, also at an alpha of 1;
+    the reference also in forward mode and twice. It therefore runs under the transforms of
+    `torch.func` if `backend` is auto.
 
     Args:
         alpha_k: (k,) float32 or float64 in [0, 1].
@@ -166,10 +177,19 @@ def composite(
     check.tensors(context, device, fields, {"r": rays, "o": rays + 1})
     stop_clear = 1 - check.number(context, "stop_alpha", stop_alpha, low=0, high=1, open_low=True)
     op_arguments = (alpha_k, feature_kc, offset_r, clear, stop_clear)
-    if choose_backend(backend, device) == "reference":
+    if runs_twin(backend, alpha_k, feature_kc, clear, has_backward=True):
         total, remaining, before = twins.composite(*op_arguments)
         return total, remaining, before.detach()
+    _refuse_tangents(context, ("alpha_k", "feature_kc", "clear_r"), (alpha_k, feature_kc, clear))
     return torch.ops.gvtorch.composite(*op_arguments)
+
+
+def _refuse_tangents(context: str, names: Sequence[str], tensors: Sequence[Tensor]) -> None:
+    """Raises RuntimeError for gradients of forward mode, which the compiled ops would lose."""
+    for name, tensor in zip(names, tensors, strict=True):
+        if check.has_tangent(tensor):
+            hint = "backend must be auto or reference for those of forward mode"
+            raise RuntimeError(f"{context}: gradients by {name} would be lost: {hint}")
 
 
 @fake_of("count_segments")
@@ -278,6 +298,12 @@ def _fake_order(segment_k: Tensor, *_: Any) -> tuple[Tensor, ...]:
 
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:
     """Returns the gradients by bricks and constants, in their dtype, and None for the rest."""
+    if torch.are_deterministic_algorithms_enabled():
+        problem = "sample_bricks: its gradients are not deterministic"
+        problem += ": backend must be auto or reference for torch.use_deterministic_algorithms"
+        if not torch.is_deterministic_algorithms_warn_only_enabled():
+            raise RuntimeError(problem)
+        warnings.warn(problem, stacklevel=2)
     pairs = zip(ctx.saved_tensors, ctx.numbers, strict=True)
     inputs = [number if tensor is None else tensor for tensor, number in pairs]
     named = dict(zip(argument_names(torch.ops.gvtorch.sample_bricks), inputs, strict=True))

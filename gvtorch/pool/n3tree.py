@@ -142,6 +142,7 @@ class N3Tree:
         return self.nodes.nbytes + self.bricks.nbytes
 
     @property
+    @lasting
     def place(self) -> Tensor:
         """(3, 3) float64 by which kernels transform rays into tree units: the scene's low corner in
         the world, the world size of the root cube, the scene's high corner in tree units.
@@ -328,16 +329,18 @@ class N3Tree:
         volume.filter = self.filters.get(name, "mean")
         return volume
 
+    @lasting
     @torch.no_grad()
     def refresh(self, box: Sequence[Sequence[float]] | Tensor | None = None) -> None:
         """Recomputes borders, coarse levels, regions and ranges after the finest bricks were edited
         or trained. If every region had a brick when the tree was built, bricks, ranges and pictures
         then equal, in every bit, those of a tree that `from_volume` makes of `to_volume()`.
 
-        It reads the voxels of the finest bricks without their borders; all else is overwritten. A
-        region without a brick, because it was CONSTANT or EMPTY when the tree was built, stays as
-        it is, up to its faces, whatever is edited beside it. One with a brick becomes CONSTANT or
-        EMPTY where its voxels are, and uses its brick again when they change; bricks that require
+        It reads the voxels of the finest bricks without their borders; all else is overwritten,
+        also what borders and coarse bricks have learned: train with `lod="finest"`. A region
+        without a brick, because it was CONSTANT or EMPTY when the tree was built, stays as it is,
+        up to its faces, whatever is edited beside it. One with a brick becomes CONSTANT or EMPTY
+        where its voxels are, and uses its brick again when they change; bricks that require
         gradients stay bricks. Coarse channels, such as `Filtered` colours, are not updated and have
         to be made again. It runs on the host.
 

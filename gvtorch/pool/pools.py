@@ -170,6 +170,9 @@ def _write_state(voxels: Tensor) -> _WriteState:
     """Returns a tensor's address and how often it was written in place, or -1 for an inference
     tensor, of which torch does not count that.
     """
+    wrapped = torch._C._functorch.is_functorch_wrapped_tensor  # in a transform of torch.func
+    while not torch.compiler.is_compiling() and wrapped(voxels):
+        voxels = torch._C._functorch.get_unwrapped(voxels)
     return (voxels.data_ptr(), -1 if voxels.is_inference() else voxels._version)
 
 
@@ -361,8 +364,12 @@ class BrickPool(_Pool):
         """Returns the edited channels that were not returned before: each edit once. `learned`:
         without those that require gradients.
         """
+
+        def is_learned(voxels: Tensor) -> bool:
+            return voxels.requires_grad or check.has_tangent(voxels)
+
         new = [name for name in self.edited() if name not in self._reported]
-        new = [name for name in new if not (learned and self.bricks[name].requires_grad)]
+        new = [name for name in new if not (learned and is_learned(self.bricks[name]))]
         self._reported.update(new)
         return new
 

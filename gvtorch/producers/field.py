@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -12,7 +13,9 @@ from torch import Tensor, nn
 from ..base import check
 from ..base.check import extent_in, extent_of
 from ..base.constants import DEEP_VOXELS
+from ..base.lasting import without_autocast
 from ..base.messages import with_type
+from ..base.own_dtypes import OwnDtypes
 from ..fields import Distance, Field, Interval, Solid
 from ..fields.field import checked_field
 from ..pool import Channel
@@ -21,10 +24,12 @@ from .producer import Bricks, Nodes, Producer, Region, Regions, check_points, cl
 
 _BATCH_BRICKS = 64  # made at a time on the CPU, so that intermediate values fit into its caches
 _MIN_GROUP_BRICKS = 12  # smaller groups cost more than leaving out parts of a field saves
+#: Modules that compute something else while they are trained.
+_TRAINING_DIFFERS = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
 _ROUNDING = 2.0**-18  # relative widening of intervals, because values are rounded too
 
 
-class FieldProducer(Producer):
+class FieldProducer(OwnDtypes, Producer):
     """Evaluates a field where rays ask for it: any `Field`, or any module that computes values
     (..., c), or {channel: (..., c)}, from world positions (..., 3).
 
@@ -141,7 +146,11 @@ class FieldProducer(Producer):
     def fill(self, nodes: Nodes) -> Bricks:
         """Evaluates the field at every voxel, border included. On the CPU, bricks are batched by
         which parts of the field matter in them, and only these parts are evaluated.
+
+        Raises:
+            ValueError: A part of the field is in training mode, and computes other values there.
         """
+        _check_evaluates(type(self).__name__, self.field)
         if nodes.loc.device.type != "cpu" or torch.compiler.is_compiling():
             data = self._evaluate(nodes, self.field)
         else:
@@ -311,6 +320,28 @@ def moving_nodes(
     return moves
 
 
+def _check_evaluates(context: str, field: nn.Module) -> None:
+    """Raises ValueError if a field's values depend on other values of a batch, or on chance."""
+    for part in field.modules():
+        if part.training and isinstance(part, _TRAINING_DIFFERS):
+            kind = f"field {type(field).__name__} holds a {type(part).__name__} in training mode"
+            raise ValueError(f"{context}: {kind}: bricks would depend on their batch: call eval()")
+
+
+@contextmanager
+def _evaluating(field: nn.Module) -> Iterator[None]:
+    """Lets the block call a field in evaluation mode, which leaves the field as it is."""
+    training = [part for part in field.modules() if part.training]
+    try:
+        for part in training:
+            part.training = False
+        yield
+    finally:
+        for part in training:
+            part.training = True
+
+
+@without_autocast
 def _call_field(context: str, field: nn.Module, method: Callable[..., Any], *arguments: Any) -> Any:
     """Calls a method of a field; if it fails, raises a ValueError of one line, naming the field."""
     try:
@@ -352,7 +383,7 @@ def _field_channels(context: str, field: nn.Module) -> dict[str, Channel]:
     tensors = [*field.parameters(), *field.buffers()]
     device = tensors[0].device if tensors else torch.device("cpu")
     points = torch.full((2, 5, 3), 0.25, dtype=torch.float32, device=device)
-    with torch.no_grad():
+    with torch.no_grad(), _evaluating(field):
         if isinstance(field, Field) and field.prefiltered:
             values = _call_field(context, field, field.filtered, points, points)
         else:

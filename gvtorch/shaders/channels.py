@@ -12,6 +12,7 @@ import torch
 
 from ..base import check
 from ..base.image_info import COLORS, ChannelInfo, array_from_srgb, to_hex
+from ..base.lasting import lasting
 from ..base.volume import Volume
 from ..io.stores.store import Store
 from ..io.window import windows
@@ -198,6 +199,7 @@ class Channels(Shader):
         """The highest index that it reads from a voxel: the op checks that voxels have it."""
         return max((component for component, _ in self._visible_functions()), default=0)
 
+    @lasting
     def table(self, sampling: Sampling) -> ColorTable:
         """Returns the header and the rows of all channels, see csrc/shaders/channels.h."""
         functions = self._visible_functions()
@@ -255,7 +257,7 @@ def _make_table(
             halvings = np.log1p(-rows[:, 3]) * (-length / math.log(2))
         halvings = np.minimum(halvings, _OPAQUE_HALVINGS)
         table[:, row_slice, 3] = halvings * 2.0 ** np.arange(levels)[:, None]
-        opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0)
+        opaque_m[row_slice] = np.cumsum(rows[:, 3] > 0, dtype=np.int32)
         used_rows += len(rows)
     dtype, device = sampling.dtype, sampling.device
     return ColorTable(

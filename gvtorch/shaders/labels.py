@@ -12,6 +12,7 @@ from torch import Tensor
 from ..base import check
 from ..base.checked import Check, flag, optional, positive
 from ..base.image_info import array_from_srgb
+from ..base.lasting import lasting
 from ..ops.reference.labels import LabelNumbers
 from ..pool import N3Tree
 from .colors import distinct_colors, linear_color
@@ -134,6 +135,7 @@ class Labels(LitShader):
 
         return self._cached(tree, channel, (tree.device,), make)
 
+    @lasting
     def _cached(self, tree: N3Tree, channel: str, key: Any, make: Callable[[], _Made]) -> _Made:
         """Returns what `make` returns for a tree's labels; caches the last few, also for copies."""
         labels = tree.labels[channel]

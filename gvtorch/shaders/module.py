@@ -29,7 +29,8 @@ class ModuleShader(Shader, torch.nn.Module):
     For k samples the module gets `values` (k, c) of all channels, concatenated, in data units;
     `positions` (k, 3) and `directions` (k, 3) in world units; and `lengths` (k, 1), the world
     lengths of the samples' intervals. It returns linear RGB (k, 3), not premultiplied, and the
-    alpha (k, 1) over those lengths, in [0, 1]. Its parameters must be on the tree's device.
+    alpha (k, 1) over those lengths, in [0, 1], of the values' dtype or, where autocast is on, of
+    autocast's. Its parameters must be on the tree's device.
 
     Pictures have gradients with respect to the parameters, and to floating-point bricks that
     require them. All samples then stay in memory until the backward pass; without gradients
@@ -90,7 +91,7 @@ class ModuleShader(Shader, torch.nn.Module):
         if not (isinstance(output, Sequence) and len(output) == 2):
             got = f"{len(output)} parts" if isinstance(output, Sequence) else type(output).__name__
             raise ValueError(f"ModuleShader: the module must give colour and alpha, got {got}")
-        color, alpha = output
+        color, alpha = (_uncast(part, values) for part in output)
         count, dtype, device = len(values), values.dtype, values.device
         check.tensor("ModuleShader", "the module's colour", color, (count, 3), dtype, device)
         check.tensor("ModuleShader", "the module's alpha", alpha, (count, 1), dtype, device)
@@ -99,6 +100,14 @@ class ModuleShader(Shader, torch.nn.Module):
         if not bool(torch.isfinite(color).all()):
             raise ValueError("ModuleShader: the module's colour must be finite")
         return color, alpha
+
+
+def _uncast(part: Any, values: Tensor) -> Any:
+    """Returns what a module gave; in the dtype of the values if autocast has changed that."""
+    kind = values.device.type
+    if isinstance(part, Tensor) and torch.is_autocast_enabled(kind):
+        return part.to(values.dtype) if part.dtype == torch.get_autocast_dtype(kind) else part
+    return part
 
 
 def _callable(module: Any) -> Any:

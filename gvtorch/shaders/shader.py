@@ -73,7 +73,9 @@ class ColorTable:
         return cls(
             table_lm4=torch.tensor(table, dtype=dtype, device=device),
             domain_2=torch.tensor(domain, dtype=dtype, device=device),
-            opaque_m=torch.tensor(np.cumsum(visible_m), dtype=torch.int32, device=device),
+            opaque_m=torch.tensor(
+                np.cumsum(visible_m, dtype=np.int32), dtype=torch.int32, device=device
+            ),
         )
 
 

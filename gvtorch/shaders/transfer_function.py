@@ -18,6 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ..base import check
 from ..base.checked import Check, class_name, optional, positive
+from ..base.lasting import lasting
 from ..base.messages import one_line
 from ..base.whole_file import write_text
 from .preset_files import paraview_item, read_preset
@@ -218,6 +219,7 @@ class TransferFunction(Shader):
         """
         return self.kept(TransferFunction._make_table, sampling)
 
+    @lasting
     def kept(
         self, make: Callable[[TransferFunction, Sampling], ColorTable], sampling: Sampling
     ) -> ColorTable:

@@ -16,6 +16,7 @@ from torch import Tensor
 from ..base import check
 from ..base.arrays import as_volume
 from ..base.explicit import explicit
+from ..base.lasting import lasting
 from ..base.records import Hits, Rays, RenderStats
 from ..base.stage import Progress, check_progress, collect_timings, no_progress, stage
 from ..cameras.camera import Camera
@@ -223,6 +224,7 @@ class View:
     options: RenderOptions
 
     @classmethod
+    @lasting
     def of(cls, camera: Camera, trees: Sequence[TreeTrace], options: RenderOptions) -> View:
         """Places a camera around the trees, and sends its numbers to their device."""
         placed = camera.placed(box_around([tree.box for tree in trees]))

@@ -99,6 +99,14 @@ class Tracer:
         args = self.arguments
         return Tracer(self.tree, shader, options, by_level=args.by_level, frame_1=args.frame_1)
 
+    def learned(self) -> list[Tensor]:
+        """Returns the parameters and voxels by which a module shader gives gradients."""
+        if not isinstance(self.shader, ModuleShader):
+            return []
+        names, bricks = self.shader.channels or (self.channel,), self.tree.bricks.bricks
+        tensors = (*self.shader.parameters(), *(bricks[name] for name in names))
+        return [tensor for tensor in tensors if tensor.requires_grad]
+
     def to_tree(self, rays: Rays) -> Rays:
         """Returns world rays in the tree's axes."""
         return rays if self.pose is None else self.pose.to_tree(rays)
@@ -304,14 +312,15 @@ def march(
         sums = sums.index_add(0, open_index, part_sums)
         clear = clear.index_put((open_index,), clear_after)
         with torch.no_grad():
-            samples.index_add_(0, open_index[batch.ray], (clear_before > 0).to(torch.int32))
+            taken = (clear_before > 0).to(torch.int32)
+            samples = samples.index_add(0, open_index[batch.ray], taken)
             passes = reaches_depth(clear_before, clear_before * (1 - alpha), arguments.depth_alpha)
             hit = passes.nonzero()[:, 0]
             fraction = torch.log(hit_clear / clear_before[hit]) / torch.log1p(-alpha[hit])
             fraction = torch.where(alpha[hit] < 1, fraction.clamp(0, 1), 0.0)
             hit_ray, in_tree = batch.ray[hit], batch.starts[hit] + fraction * batch.lengths[hit, 0]
             hit_depth = in_tree + batch.entry_distance[hit_ray]
-            depth[open_index[hit_ray]] = hit_depth.to(like.dtype)
+            depth = depth.index_put((open_index[hit_ray],), hit_depth.to(like.dtype))
             is_open = (segments.counts[:, 1] >= limit) & (clear_after > 1 - stop_alpha)
             left = is_open.nonzero()[:, 0]
         open_rays, open_index, state = open_rays.some(left), open_index[left], segments.state[left]

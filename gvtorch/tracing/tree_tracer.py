@@ -6,8 +6,8 @@ archive import `gvtorch.ops` first; C++ programs open `libgvtorch_cpu.so`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from ..base import check
 from ..base import constants as config
 from ..base.lasting import lasting
+from ..base.own_dtypes import OwnDtypes
 from ..base.records import Rays
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
@@ -26,11 +27,12 @@ from .options import RenderOptions
 from .tracer import Tracer
 
 
-class TreeTracer(torch.nn.Module):
+class TreeTracer(OwnDtypes):
     """Traces world rays through a resident tree, as `render` does. Pools are buffers: `.to(device)`
     moves them. Their dtypes stay as kernels need them, even if `half()`, `bfloat16()` or `double()`
     is called on a net that contains the module. Any number of threads may trace at a time, while
-    none writes into its buffers.
+    none writes into its buffers. `DistributedDataParallel` needs `broadcast_buffers=False`: each
+    process has the pools, and what sends buffers there knows no 16-bit integers.
 
     Buffers and numbers are named after the ops' arguments. Light and material of a lit shader are
     the buffer `parameter_54`, see `ops.shade_rays`; it may be edited.
@@ -103,15 +105,6 @@ class TreeTracer(torch.nn.Module):
     def __repr__(self) -> str:
         return f"TreeTracer({self.about})"
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        """Moves the buffers without changing their dtypes."""
-
-        def convert(tensor: Tensor) -> Tensor:
-            converted = fn(tensor)
-            return converted if converted.dtype == tensor.dtype else tensor.to(converted.device)
-
-        return super()._apply(convert, recurse)
-
     @torch.jit.unused
     def rays(self, camera: Camera | Rays) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Returns the rays of a camera's pixels as `forward` takes them, in the shape of its
@@ -167,6 +160,9 @@ class TreeTracer(torch.nn.Module):
 
         Returns:
             float32 color (..., 3) premultiplied, alpha and depth (..., 1); int32 samples (...).
+
+        Raises:
+            ValueError: A tensor has another shape.
         """
         color, alpha, depth, samples, _, _ = self.hits(origin, direction, cone, range)
         return color, alpha, depth, samples
@@ -179,11 +175,14 @@ class TreeTracer(torch.nn.Module):
         (0, 0) where the shader gives none.
         """
         leading = list(origin.shape[:-1])
-        columns = [
-            column.to(torch.float64).reshape(-1, column.shape[-1]).contiguous()
-            for column in (origin, direction, cone, range)
-        ]
-        rays = RayArguments(columns[0], columns[1], columns[2], columns[3], 0, None)
+        rays = RayArguments(
+            _rows("origin", origin, leading, 3),
+            _rows("direction", direction, leading, 3),
+            _rows("cone", cone, leading, 2),
+            _rows("range", range, leading, 2),
+            0,
+            None,
+        )
         arguments = self.arguments()
         if self.plain:
             color, alpha, depth, samples, _ = torch.ops.gvtorch.trace_rays(*rays, *arguments)
@@ -248,6 +247,14 @@ def _check_words(tensors: Mapping[str, Any], prefix: str) -> None:
     child, brick, bricks = pools
     check.integers_in("TreeTracer", f"{prefix}child_tn", child, config.TERMINAL, len(child) - 1)
     check.integers_in("TreeTracer", f"{prefix}brick_tn", brick, config.CONSTANT, len(bricks) - 1)
+
+
+def _rows(name: str, column: Tensor, leading: list[int], width: int) -> Tensor:
+    """Returns a column of rays (..., width) as float64 rows; ValueError for another shape."""
+    shape = leading + [width]  # noqa: RUF005  (TorchScript has no stars here)
+    if list(column.shape) != shape:
+        raise ValueError(f"TreeTracer: {name} must be {shape}, got {list(column.shape)}")
+    return column.to(torch.float64).reshape(-1, width).contiguous()
 
 
 def _unflatten(rows: Tensor, leading: list[int]) -> Tensor:

@@ -66,8 +66,22 @@ def box_around(boxes: Sequence[Tensor]) -> Tensor:
 def trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
     """Traces rays through several trees; see the head of this file.
 
-    Projections, and shaders that must see a whole ray at once, are not composited by sample: the
-    tree whose box is entered first is in front as a whole.
+    Where no ray has a sample, gradients by all that module shaders learn are 0, so that a loss can
+    always be taken backward.
+    """
+    hits = _trace_trees(trees, rays)
+    if not torch.is_grad_enabled() or hits.color.requires_grad:
+        return hits
+    learned = [tensor for tree in trees for tensor in tree.tracer.learned()]
+    if not learned:
+        return hits
+    zeros = [tensor.flatten()[:0].sum().to(hits.color) for tensor in learned]
+    return replace(hits, color=sum(zeros, hits.color), alpha=sum(zeros, hits.alpha))
+
+
+def _trace_trees(trees: Sequence[TreeTrace], rays: Rays) -> Hits:
+    """See `trace_trees`. Projections, and shaders that must see a whole ray at once, are not
+    composited by sample: the tree whose box is entered first is in front as a whole.
     """
     if len(trees) == 1:
         return trees[0].trace(rays)

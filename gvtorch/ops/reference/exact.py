@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.forward_ad import unpack_dual
 from torch.compiler import is_compiling
 from torch.jit import is_tracing
 from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+from ...base.check import has_tangent
 
 TINY = 1.1754944e-38  # smallest normal float32: a transmittance not above it counts as opaque
 
@@ -47,7 +48,7 @@ def _as_numpy(value: Tensor) -> np.ndarray | None:
     if tracked or value.dtype not in (torch.float32, torch.float64):
         return None
     try:
-        return value.numpy() if unpack_dual(value).tangent is None else None
+        return None if has_tangent(value) else value.numpy()
     except RuntimeError:  # a tensor of `torch.func` has no memory
         return None
 
@@ -109,7 +110,10 @@ def log_exact(value: Tensor) -> Tensor:
     exponent, s, series = _log_series(detached)
     finite = exponent * 0.6931471805599453 + s * series
     logarithm = torch.where(detached < torch.inf, finite, detached)
-    return logarithm + (value - detached) / detached if value.requires_grad else logarithm
+    if not (value.requires_grad or has_tangent(value)):
+        return logarithm
+    slope = torch.log(value)  # torch differentiates it, in both modes and again
+    return logarithm + (slope - slope.detach())
 
 
 def _log_series(value: Tensor) -> tuple[Tensor, Tensor, Tensor]:

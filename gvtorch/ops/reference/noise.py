@@ -21,6 +21,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ...base.check import is_recorded
 from .exact import sqrt_exact
 
 #: Points evaluated together on the CPU: their temporaries then stay in its caches.
@@ -283,7 +284,7 @@ def in_chunks(evaluate: Callable[..., Tensor], axes: Sequence[Tensor]) -> Tensor
     """
     first = axes[0]
     at_once = first.device.type != "cpu" or torch.compiler.is_compiling()
-    needs_gradient = torch.is_grad_enabled() and any(axis.requires_grad for axis in axes)
+    needs_gradient = any(map(is_recorded, axes))
     if at_once or needs_gradient or first.numel() <= CHUNK:
         return evaluate(*axes)
     flat = [coordinate.reshape(-1) for coordinate in axes]
