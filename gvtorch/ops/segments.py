@@ -5,7 +5,6 @@ last two are differentiable. They raise as those of `trace.py` do.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -100,10 +99,9 @@ def sample_bricks(
     backend: Backend = "auto",
 ) -> Tensor:
     """Reads all numbers of a channel at samples: trilinear, two levels blended, in the same bits as
-    `trace_rays` reads one of them. Differentiable by bricks and constants that are floats; the
-    reference also in forward mode and twice. It therefore runs under the transforms of `torch.func`
-    and, if there are gradients, where `torch.use_deterministic_algorithms` is on, if `backend` is
-    auto.
+    `trace_rays` reads one of them. Differentiable by bricks and constants that are floats, with the
+    same bits in every run; the reference also in forward mode and twice. It therefore runs under
+    the transforms of `torch.func` if `backend` is auto.
 
     Args:
         rays: The rays that were walked.
@@ -117,9 +115,7 @@ def sample_bricks(
     """
     context, device = "sample_bricks", rays.origin_r3.device
     voxels = (arguments.bricks_bzyxc, arguments.constant_tnc)
-    # The op's backward adds up in whatever order threads come.
-    has_backward = not torch.are_deterministic_algorithms_enabled()
-    is_twin = runs_twin(backend, *voxels, has_backward=has_backward)
+    is_twin = runs_twin(backend, *voxels, has_backward=True)
     if not is_twin:  # the reference also reads float64
         check_voxels(context, arguments)
         _refuse_tangents(context, _DIFFERENTIABLE, voxels)
@@ -298,12 +294,6 @@ def _fake_order(segment_k: Tensor, *_: Any) -> tuple[Tensor, ...]:
 
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:
     """Returns the gradients by bricks and constants, in their dtype, and None for the rest."""
-    if torch.are_deterministic_algorithms_enabled():
-        problem = "sample_bricks: its gradients are not deterministic"
-        problem += ": backend must be auto or reference for torch.use_deterministic_algorithms"
-        if not torch.is_deterministic_algorithms_warn_only_enabled():
-            raise RuntimeError(problem)
-        warnings.warn(problem, stacklevel=2)
     pairs = zip(ctx.saved_tensors, ctx.numbers, strict=True)
     inputs = [number if tensor is None else tensor for tensor, number in pairs]
     named = dict(zip(argument_names(torch.ops.gvtorch.sample_bricks), inputs, strict=True))
