@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from ..viewer.state import ViewState
 
 
+_EQUAL_CONTRAST = (
+    0.18  # luminance, linear: black and white differ from it by the same factor (WCAG)
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Annotations:
     """What is drawn over the picture."""
@@ -48,7 +53,18 @@ class Annotations:
             pixel=camera.pixel_width(math.dist(eye.eye, eye.target)) if self.scale_bar else None,
             unit=info.unit,
             text=self.annotate,
+            ink="black" if _is_light(state.options.background) else "white",
         )
+
+
+def _is_light(background: object) -> bool:
+    """Returns whether a background is one colour, from which black stands out more than white."""
+    from ..pictures.tone import LUMINANCE
+
+    if not isinstance(background, tuple):
+        return False
+    luminance = sum(n * weight for n, weight in zip(background, LUMINANCE, strict=True))
+    return luminance > _EQUAL_CONTRAST
 
 
 def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
@@ -60,5 +76,5 @@ def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
         raise ValueError(f"--bar is for transfer functions, not for {type(shader).__name__}")
     values = [*transfer.opacity[:, 0], *transfer.color[:, 0]]
     names = [info.channels[component].name] if component < len(info.channels) else []
-    title = ", ".join(part for part in (*names, info.quantity) if part)
+    title = ", ".join(dict.fromkeys(part for part in (*names, info.quantity) if part))
     return ColorBar(colors=transfer, low=min(values), high=max(values), title=title)

@@ -317,9 +317,13 @@ class ViewState:
 
 
 def transfer_of(shader: Shader) -> TransferFunction | None:
-    """Returns a shader's transfer function, which may be the shader itself, or None."""
-    transfer = getattr(shader, "transfer", None) or shader
-    return transfer if isinstance(transfer, TransferFunction) else None
+    """Returns a shader's transfer function, which may be the shader itself or that of the shader
+    which it filters, or None.
+    """
+    if isinstance(shader, TransferFunction):
+        return shader
+    inner = getattr(shader, "transfer", None)
+    return None if inner is None else transfer_of(inner)
 
 
 def costed(shader: Shader) -> TransferFunction:
