@@ -8,6 +8,7 @@ import torch
 from helpers import gvtorch
 
 import gvtorch as gv
+from gvtorch.pictures.letters import _GLYPH_ROWS
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +207,17 @@ def test_letters_stand_at_the_edges_and_nowhere_else():
     assert not gv.slice_picture(small, **options, letters=True).color.any()
 
 
+def test_letters_of_three_planes_have_one_size():
+    """Also if one of the planes is narrow: a dot is a pixel, as for the narrowest."""
+    body = gv.Volume(np.zeros((330, 330, 60), np.float32), info=gv.ImageInfo(space=RAS))
+    image = gv.slice_picture(body, "all", 0.5, span=(0, 1), radiological=True, letters=True).color
+    dots = {name: sum(row.bit_count() for row in rows) for name, rows in _GLYPH_ROWS.items()}
+    white = (image == 1).all(2)
+    coronal, sagittal, axial = white[:330, :60], white[:330, 64:], white[334:, :60]
+    for plane, letters in ((coronal, "SLIR"), (sagittal, "SPIA"), (axial, "ALPR")):
+        assert int(plane.sum()) == sum(dots[letter] for letter in letters)
+
+
 @pytest.mark.parametrize(
     ("space", "options", "message"),
     [
@@ -227,6 +239,9 @@ def test_the_command_shows_patients(tmp_path):
     out = tmp_path / "a.png"
     run = gvtorch("slice", tmp_path / "a.nii", "-o", out)
     assert run.returncode == 0 and "axial: right is on the left" in run.stdout
+    run = gvtorch("slice", tmp_path / "a.nii", "-o", tmp_path / "c.png", "--axis", "all")
+    assert run.returncode == 0
+    assert "coronal and axial: right is on the left, sagittal: front is on the left" in run.stdout
     run = gvtorch("slice", tmp_path / "a.nii", "-o", tmp_path / "b.png", "--plain")
     assert run.returncode == 0 and out.read_bytes() != (tmp_path / "b.png").read_bytes()
 

@@ -69,6 +69,10 @@ def array_from_srgb(color: np.ndarray) -> np.ndarray:
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
+#: `ImageInfo.quantity` of level sets and distances to meshes: world units, negative inside.
+SIGNED_DISTANCE = "signed distance"
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImageInfo:
     """What is known about an image's values; what a file does not say keeps its default."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..base.declared import declared_names, declared_texts
+from ..base.image_info import SIGNED_DISTANCE
 from .common import given_flags, option, parse_numbers
 from .parse import (
     parse_background,
@@ -89,7 +90,8 @@ class Look:
     # window; parts left out or auto come from the file, or are chosen; the item opacity makes
     # channels hide each other instead of adding up
     channel: Annotated[str | None, option(metavar="N:COLOR:LO,HI;...")] = None
-    # value of the surface, for --shader isosurface
+    # value of the surface, for --shader isosurface; signed distances (level sets, --channel distance
+    # of gvtorch voxelize) are solid below it, and their surface at 0 is shown without --tf, --window
     value: Annotated[float | None, option(metavar="VALUE")] = None
     # distance between samples along a ray, in voxels of the finest level
     step: Annotated[float, option(metavar="VOXELS")] = 0.5
@@ -208,9 +210,10 @@ class Look:
 
     def make_shader(self, data: Volume | Store) -> Shader:
         """Returns the shader that the flags choose, with its transfer function read from a file or
-        stretched over the data; `Labels` for data that holds labels.
+        stretched over the data; `Labels` for data that holds labels, and the surface of signed
+        distances.
         """
-        from ..shaders import Filtered, Labels, Lit, TransferFunction
+        from ..shaders import DistanceField, Filtered, Labels, Lit, TransferFunction
         from ..shaders.built_in import BY_NAME
 
         if self.shader == "channels":
@@ -224,6 +227,9 @@ class Look:
             self.refuse_flags("labels have colours of their own")
             data.info.check_component("--component", self.component, data.width)
             return Labels()
+        is_distance = data.info.quantity == SIGNED_DISTANCE
+        if is_distance and (self.shader, self.tf, self.window) == ("plain", None, None):
+            return DistanceField(offset=self.value or 0.0)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
         if self.shader == "isosurface":
@@ -231,6 +237,8 @@ class Look:
                 if value is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
             data.info.check_component("--component", self.component, data.width)
+            if is_distance:
+                return DistanceField(offset=self.value or 0.0)
             return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
         _warn_of_other_channels(data, self.component)
         transfer = parse_transfer(self.tf, self.window, data, self.component)

@@ -86,6 +86,10 @@ class Slice:
             )
         height, width, _ = picture.color.shape
         picture.save(self.output, bits=self.bits)
-        names = [view.name for axis, view in views.items() if self.axis in (axis, "all")]
-        note = f", {' and '.join(names)}: right is on the left" if names else ""
+        shown = [view for axis, view in views.items() if self.axis in (axis, "all")]
+        note = "".join(
+            f", {' and '.join(names)}: {side} is on the left"
+            for letter, side in (("R", "right"), ("A", "front"))
+            if (names := [view.name for view in shown if view.letters.endswith(letter)])
+        )
         print(f"{printable(self.output)}: {width}x{height}{note}")

@@ -7,7 +7,7 @@ voxels of the plane are read.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -101,13 +101,24 @@ def slice_picture(
             raise ValueError(f"{_NAME}: position must be {wanted}, got {position!r}")
         position_of = dict(zip("xyz", positions, strict=True))
         pixel = min(reader.spacing.values()) / scale
-        planes = (reader.colored(n, position_of[n], views[n], pixel, colors) for n in "xyz")
+        planes = [reader.colored(n, position_of[n], views[n], pixel, colors) for n in "xyz"]
+        _draw_all_letters(planes, [views[n] for n in "xyz"])
         return _picture(_arranged(*planes))
     if isinstance(position, tuple):
         raise ValueError(f"{_NAME}: position must be one for axis {axis}, got {position!r}")
     pixel = min(reader.spacing[n] for n in "xyz" if n != axis) / scale
     view = views[axis] if up is None else PlaneView("", up)
-    return _picture(reader.colored(axis, position, view, pixel, colors))
+    plane = reader.colored(axis, position, view, pixel, colors)
+    _draw_all_letters([plane], [view])
+    return _picture(plane)
+
+
+def _draw_all_letters(planes: Sequence[np.ndarray], views: Sequence[PlaneView]) -> None:
+    """Draws the letters of planes that are shown together, all of one size."""
+    shortest_side = min(side for plane in planes for side in plane.shape[:2])
+    for plane, view in zip(planes, views, strict=True):
+        if view.letters:
+            draw_letters(plane, view.letters, shortest_side)
 
 
 def _colors(
@@ -279,10 +290,7 @@ class _PlaneReader:
             raise ValueError(f"slice_picture: colors must return {wanted}, got {got}")
         nbytes = len(rows) * len(columns) * colored.shape[2] * colored.itemsize
         check.memory("slice_picture", "the picture", nbytes, torch.device("cpu"))
-        image = colored[np.ix_(rows, columns)][..., :3]
-        if view.letters:
-            draw_letters(image, view.letters)
-        return image
+        return colored[np.ix_(rows, columns)][..., :3]
 
 
 def _voxel_of_pixels(count: int, size: float) -> np.ndarray:
