@@ -90,8 +90,8 @@ class Look:
     # window; parts left out or auto come from the file, or are chosen; the item opacity makes
     # channels hide each other instead of adding up
     channel: Annotated[str | None, option(metavar="N:COLOR:LO,HI;...")] = None
-    # value of the surface, for --shader isosurface; signed distances (level sets, --channel distance
-    # of gvtorch voxelize) are solid below it, and their surface at 0 is shown without --tf, --window
+    # value of the surface, for --shader isosurface; signed distances (level sets, and --channel
+    # distance of gvtorch voxelize) are solid below it, and shown so at 0 without --tf and --window
     value: Annotated[float | None, option(metavar="VALUE")] = None
     # distance between samples along a ray, in voxels of the finest level
     step: Annotated[float, option(metavar="VOXELS")] = 0.5
@@ -213,7 +213,7 @@ class Look:
         stretched over the data; `Labels` for data that holds labels, and the surface of signed
         distances.
         """
-        from ..shaders import DistanceField, Filtered, Labels, Lit, TransferFunction
+        from ..shaders import DistanceField, Filtered, Isosurface, Labels, Lit
         from ..shaders.built_in import BY_NAME
 
         if self.shader == "channels":
@@ -227,19 +227,17 @@ class Look:
             self.refuse_flags("labels have colours of their own")
             data.info.check_component("--component", self.component, data.width)
             return Labels()
-        is_distance = data.info.quantity == SIGNED_DISTANCE
-        if is_distance and (self.shader, self.tf, self.window) == ("plain", None, None):
-            return DistanceField(offset=self.value or 0.0)
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
-        if self.shader == "isosurface":
+        is_distance = data.info.quantity == SIGNED_DISTANCE
+        is_default = (self.shader, self.tf, self.window) == ("plain", None, None)
+        if self.shader == "isosurface" or (is_distance and is_default):
             for flag, value in (("--tf", self.tf), ("--window", self.window)):
                 if value is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
             data.info.check_component("--component", self.component, data.width)
-            if is_distance:
-                return DistanceField(offset=self.value or 0.0)
-            return BY_NAME[self.shader](TransferFunction([(0, 1)]), self.value or 0.0)
+            level = self.value or 0.0
+            return DistanceField(offset=level) if is_distance else Isosurface(level)
         _warn_of_other_channels(data, self.component)
         transfer = parse_transfer(self.tf, self.window, data, self.component)
         if self.shader in ("filtered", "filtered-lit"):  # its colours are made with the tree
