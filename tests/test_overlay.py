@@ -16,7 +16,7 @@ import gvtorch as gv
 from gvtorch.base.records import RenderStats
 from gvtorch.base.units import unit_symbol
 from gvtorch.pictures.files import write_png_rows
-from gvtorch.pictures.overlay import _labels, _round_below, _ticks
+from gvtorch.pictures.overlay import _labels, _length_text, _round_below, _ticks
 from gvtorch.tools.annotations import _color_bar
 
 Library("PIL")
@@ -67,6 +67,24 @@ def test_a_scale_bar_is_as_long_as_it_says():
         assert abs((columns[-1] - columns[0] + 1) * pixel - expected) < 2.5 * pixel
         assert columns[0] < 20 and rows[0] > 200, "at the lower left"
     assert [unit_symbol(u) for u in ("micrometer", "mm", "ly", None)] == ["µm", "mm", "ly", ""]
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "text"),
+    [
+        (2e-5, "m", "20 µm"),
+        (1e6, "nanometer", "1 mm"),
+        (5e-13, "meter", "0.5 pm"),
+        (20000.0, "angstrom", "2 µm"),
+        (5e6, "kilometer", "5e+06 km"),
+        (5000.0, "um", "5000 µm"),
+        (0.002, "mm", "0.002 mm"),
+        (1e-6, "parsec", "1e-06 parsec"),
+        (1e6, None, "1e+06"),
+    ],
+)
+def test_a_scale_bar_tells_few_digits(length, unit, text):
+    assert _length_text(length, unit) == text
 
 
 def test_a_pixel_is_as_wide_as_the_rays_are_apart():

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..base import check
 from ..base.messages import need_library
-from ..base.units import unit_symbol
+from ..base.units import length_unit, metres, unit_symbol
 from .files import display_pixels
 from .picture import Picture
 from .tone import from_srgb
@@ -26,6 +26,8 @@ _MIN_LETTER_SIZE = 9  # pixels of a letter
 _BAR_FRACTION = 0.45  # height of a colour bar, as a fraction of the picture's height
 _SCALE_FRACTION = 0.25  # greatest length of a scale bar, as a fraction of the picture's width
 _MAX_TICKS = 6  # most ticks of a colour bar
+_FEWEST, _MOST = 1e-3, 1e4  # lengths that a scale bar tells in the data's own unit
+_METRIC_UNITS = ("kilometer", "meter", "millimeter", "micrometer", "nanometer", "picometer")
 _INKS = {"white": (255, 255, 255), "black": (0, 0, 0)}
 _RIM_ALPHA = 200  # of 255
 #: Letters of units that Pillow's font lacks, and those that they are drawn as, some with a mark.
@@ -239,7 +241,7 @@ class _Pen:
         """Returns a scale bar at most `limit` pixels long, (h, w, 4)."""
         length = _round_below(limit * pixel)
         width = length / pixel
-        label = f"{length:g} {unit_symbol(unit)}".rstrip()
+        label = _length_text(length, unit)
         self._warn_of_missing(label)
         rim, tick = self._rim, round(0.5 * self.size)
         label_width = self._text_width(label)
@@ -303,6 +305,17 @@ def _round_below(length: float) -> float:
     """Returns the largest 1, 2 or 5 times a power of ten that is not above a length."""
     power = _power(length)
     return max(n * power for n in (1, 2, 5) if n * power <= length * (1 + 1e-12))
+
+
+def _length_text(length: float, unit: str | None) -> str:
+    """Returns a length as text; if its unit is known, one of many digits in another metric unit."""
+    size = metres(length_unit(unit) or "")
+    if size is not None and not _FEWEST <= length < _MOST:
+        in_metres = length * size * (1 + 1e-9)
+        fitting = [n for n in _METRIC_UNITS if (metres(n) or 0.0) <= in_metres]
+        unit = fitting[0] if fitting else _METRIC_UNITS[-1]
+        length *= size / (metres(unit) or 1.0)
+    return f"{length:g} {unit_symbol(unit)}".rstrip()
 
 
 def _ticks(low: float, high: float) -> list[float]:
