@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..base.declared import declared_names, declared_texts
-from ..base.image_info import SIGNED_DISTANCE
+from ..base.image_info import SIGNED_DISTANCE, up_and_front
 from .common import given_flags, option, parse_numbers
 from .parse import (
     parse_background,
@@ -268,16 +268,6 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
         raise ValueError(f"{flag} must be AZ,EL or AZ,EL,DIST, got {text!r}")
     azimuth, elevation, *distance = parse_numbers(flag, numbers, count, float)
     return azimuth, elevation, distance[0] if distance else None
-
-
-def up_and_front(space: str | None) -> tuple[Up, float]:
-    """Returns the up direction and the azimuth of the front, given where x, y and z point
-    (`ImageInfo.space`): for patients, the directions of the head and of the face.
-    """
-    axes = (space or "").split("-")
-    if len(axes) == 3 and axes[2] == "superior" and axes[1] in ("anterior", "posterior"):
-        return "+z", 180.0 if axes[1] == "anterior" else 0.0
-    return "+y", 0.0
 
 
 def default_orbit(space: str | None) -> str:
