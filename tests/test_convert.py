@@ -474,6 +474,18 @@ def test_command_converts_and_tells(tmp_path, raw, data, capsys):
     assert code == 2 and "leave --workers out" in err
 
 
+def test_an_estimate_has_the_workers_that_memory_allows(tmp_path, monkeypatch):
+    """As the conversion itself."""
+    data = gv.Volume(noise((300, 300, 8, 1)))
+    one, three = (estimate(data, tmp_path / "a.zarr", workers=n).memory_bytes for n in (1, 3))
+    assert estimate(data, tmp_path / "a.zarr", workers=3, memory=(one + three) // 2).workers == 2
+    assert estimate(data, tmp_path / "a.zarr", workers=3, memory=one).workers == 1
+    with pytest.raises(ValueError, match="is too little, one worker takes"):
+        estimate(data, tmp_path / "a.zarr", memory=one // 2)
+    monkeypatch.setattr("gvtorch.io.stores.conversion_plan.resources.memory_free", lambda: 1)
+    assert estimate(data, tmp_path / "a.zarr").workers == 1
+
+
 def test_estimate_is_near_the_truth(tmp_path):
     data = noise((150, 150, 150, 1))
     estimated = estimate(gv.Volume(data), tmp_path / "a.zarr")

@@ -110,6 +110,7 @@ class Convert:
 
         self.conversion.check()
         arguments: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
+        arguments["memory"] = self.memory
         if self.dry_run:
             from ..base import check
             from ..io.stores.unfinished import is_begun
@@ -122,7 +123,7 @@ class Convert:
             return
         start, was_finished = time.perf_counter(), (self.store / "zarr.json").exists()
         with self.conversion.arguments(speed=True) as store_options:
-            store = convert(self.path, self.store, **arguments, memory=self.memory, **store_options)
+            store = convert(self.path, self.store, **arguments, **store_options)
         if was_finished:  # --resume had nothing to do
             print(f"{printable(self.store)}: is finished already")
             return
