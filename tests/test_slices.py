@@ -218,6 +218,23 @@ def test_letters_of_three_planes_have_one_size():
         assert int(plane.sum()) == sum(dots[letter] for letter in letters)
 
 
+def test_labels_have_the_colours_of_labels(tmp_path):
+    """Also wide ones, of which voxels hold indices; the command leaves the background black."""
+    labels = np.zeros((3, 4, 5), np.int64)
+    labels[0, 1], labels[0, 2] = 70000, 2**40
+    volume = gv.Volume(labels, labels=True)
+    looks = gv.Labels({70000: (1.0, 0.0, 0.0)})
+    plane = gv.slice_picture(volume, "z", 0, colors=looks).color
+    assert torch.equal(plane[1], torch.tensor([[1.0, 0.0, 0.0]]).expand(5, 3))
+    assert np.allclose(plane[2].numpy(), looks(np.array([2**40]))[0, :3])
+    gv.convert(volume, tmp_path / "l.zarr")
+    out = tmp_path / "a.npz"
+    assert gvtorch("slice", tmp_path / "l.zarr", "-o", out, "--position", "0").returncode == 0
+    drawn = np.load(out)["color"]
+    assert np.allclose(drawn[1:3, 0], gv.Labels()(labels[0, 1:3, 0])[:, :3])
+    assert not drawn[0].any() and not drawn[3].any()
+
+
 @pytest.mark.parametrize(
     ("space", "options", "message"),
     [

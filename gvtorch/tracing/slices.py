@@ -23,6 +23,7 @@ from ..io.stores.store import Store
 from ..io.window import window
 from ..pictures.letters import draw_letters
 from ..pictures.picture import Picture
+from ..shaders.labels import Labels
 from ..shaders.presets import display_grays
 from ..shaders.transfer_function import TransferFunction
 
@@ -71,7 +72,8 @@ def slice_picture(
             (0, 255), the values of 8-bit voxels are their sRGB numbers. If left out, what `window`
             finds, with the background.
         colors: Instead of grays, the colours of values (not their opacity): a transfer function,
-            `Labels`, or another function from values (...) to linear red, green, blue (..., 3).
+            `Labels`, or another function from values (...) to linear red, green, blue (..., 3). Of
+            wide labels voxels hold indices: `Labels` is given the labels, others the indices.
         component: Which number of a voxel.
         level: Level of a store; 0 is the finest.
         scale: Pixels along the shortest side of a voxel.
@@ -135,7 +137,10 @@ def _colors(
     if not callable(colors) or isinstance(colors, type):
         kind = type(colors).__name__
         raise ValueError(f"{_NAME}: colors must be a function of values or Labels, got a {kind}")
-    return colors
+    if data.label_values is None or not isinstance(colors, Labels):
+        return colors
+    labels, looks = to_numpy(data.label_values), colors
+    return lambda indices: looks(labels[indices])  # which the voxels hold
 
 
 def _views(
