@@ -251,7 +251,9 @@ def test_render_and_fly_draw(scan_store, tmp_path, monkeypatch):
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize(("background", "ink"), [("0.9,1,0.9", 0), ("0.1,0.1,0.1", 255)])
+@pytest.mark.parametrize(
+    ("background", "ink"), [("0.9,1,0.9", 0), ("1,1,1/0.5,0.6,0.8", 0), ("0.1,0.1,0.1", 255)]
+)
 def test_ink_stands_out_from_the_background(small, tmp_path, background, ink):
     flags = ("--background", background, "--annotate", "Mk", "--size", "480x400")
     assert gvtorch("render", small, "-o", tmp_path / "a.png", *flags).returncode == 0

@@ -58,13 +58,18 @@ class Annotations:
 
 
 def _is_light(background: object) -> bool:
-    """Returns whether a background is one colour, from which black stands out more than white."""
+    """Returns whether black stands out more than white from a background: from its colour, or both
+    ends of its gradient.
+    """
+    import numpy as np
+
+    from ..pictures import Gradient
     from ..pictures.tone import LUMINANCE
 
-    if not isinstance(background, tuple):
-        return False
-    luminance = sum(n * weight for n, weight in zip(background, LUMINANCE, strict=True))
-    return luminance > _EQUAL_CONTRAST
+    colors = background.ends if isinstance(background, Gradient) else [background]
+    return all(
+        isinstance(color, tuple) and np.dot(color, LUMINANCE) > _EQUAL_CONTRAST for color in colors
+    )
 
 
 def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
