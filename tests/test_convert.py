@@ -465,7 +465,9 @@ def test_command_converts_and_tells(tmp_path, raw, data, capsys):
     facts = json.loads(out)
     assert facts["extent"] == [300, 20, 9] and facts["dtype"] == "uint8" and facts["levels"] == 7
     assert facts["range"] == [[float(data.min()), float(data.max())]] and facts["disk bytes"] > 0
-    assert facts["unit"] is None and "unit" not in run_cli(capsys, "info", target)[1]
+    table = run_cli(capsys, "info", target)[1]
+    assert facts["unit"] is None and "unit" not in table
+    assert f"[{data.min():g}, {data.max():g}]" in table, "as of volumes, not with all digits"
     code, out, err = run_cli(capsys, "convert", raw, target)
     assert code == 2 and err.count("\n") == 1 and "there is a store already" in err
     code, out, err = run_cli(

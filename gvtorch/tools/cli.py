@@ -225,12 +225,17 @@ def _print_table(content: dict[str, Any]) -> None:
         elif isinstance(value, dict):
             text = "\n".join(printable(f"{key}: {item}") for key, item in value.items())
         elif isinstance(value, (list, tuple)):
-            items = (f"{n:g}" if isinstance(n, float) else printable(n) for n in value)
-            text = ", ".join(items)
+            text = ", ".join(map(_cell_text, value))
         else:
-            text = f"{value:g}" if isinstance(value, float) else printable(value)
+            text = _cell_text(value)
         table.add_row(Text(name, "bold"), Text(text))
     Console().print(table)
+
+
+def _cell_text(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_cell_text, value))}]"
+    return f"{value:g}" if isinstance(value, float) else printable(value)
 
 
 def _sparkline(counts: list[int]) -> str:
