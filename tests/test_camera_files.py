@@ -187,6 +187,7 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
         )
     )
     (tmp_path / "b.json").write_text('{"frames": []}')
+    (tmp_path / "keys.json").write_text('[{"eye": [0, 0, 1], "target": [0, 0, 0]}]')
     (tmp_path / "c.pvcc").write_text("<a><Property name='CameraPosition'></Property></a>")
     (tmp_path / "d.pvcc").write_text("<a>")
     (tmp_path / "e.txt").write_text("")
@@ -196,6 +197,7 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
         (".", "a lens of model OPENCV with distortion is not read"),
         ("a.json", "frame 0: pose must be (4, 4) numbers"),
         ("b.json", "has no cameras"),
+        ("keys.json", "keys.json: must be an object with frames"),
         ("g.json", "frame 1: there is one of 'a' already"),
         ("c.pvcc", "c.pvcc: "),
         ("d.pvcc", "can't be read as cameras"),

@@ -16,6 +16,7 @@ import gvtorch as gv
 from gvtorch import cpp_ext
 from gvtorch.base.image_info import COLORS
 from gvtorch.shaders.channels import DEFAULT_COLORS, MAX_CHANNELS, channel_color
+from gvtorch.tools.parse import parse_channels
 
 SPACING, ORIGIN = (1.0, 0.8, 1.3), (3.0, -2.0, 5.0)
 MODES = ["additive", "opacity"]
@@ -435,6 +436,14 @@ def two_channels(tmp_path_factory):
     np.save(folder / "v.npy", np.stack(balls, -1).astype(np.uint16))
     assert gvtorch("convert", folder / "v.npy", folder / "v.zarr").returncode == 0
     return folder
+
+
+def test_a_name_that_no_channel_has_is_answered_with_those_that_they_have():
+    info = gv.ImageInfo(channels=[gv.ChannelInfo(name="DAPI"), gv.ChannelInfo(name="GFP")])
+    cells = gv.Volume(torch.zeros(2, 3, 4, 2), info=info)
+    assert [n.component for n in parse_channels("GFP:red", cells).looks] == [1]
+    with pytest.raises(ValueError, match="got 'RFP:red'; the channels are DAPI, GFP"):
+        parse_channels("RFP:red", cells)
 
 
 @pytest.mark.parametrize("name", ["v.npy", "v.zarr"])

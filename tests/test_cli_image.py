@@ -185,6 +185,7 @@ def others(small, tmp_path):
         ("convert v.npy stack --dry-run", "exists and is not a store"),
         ("convert v.npy a.zarr --dry-run --spacing 0,2,2", "spacing"),
         ("convert v.npy a.zarr --dry-run --memory much", "--memory"),
+        ("convert v.npy a.zarr --dry-run --memory 1MB", "a.zarr: memory of 1.0 MB is too little"),
     ],
 )
 def test_nothing_is_overwritten_and_no_flag_is_without_effect(others, args, message):

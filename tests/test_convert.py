@@ -465,13 +465,27 @@ def test_command_converts_and_tells(tmp_path, raw, data, capsys):
     facts = json.loads(out)
     assert facts["extent"] == [300, 20, 9] and facts["dtype"] == "uint8" and facts["levels"] == 7
     assert facts["range"] == [[float(data.min()), float(data.max())]] and facts["disk bytes"] > 0
-    assert facts["unit"] is None and "unit" not in run_cli(capsys, "info", target)[1]
+    table = run_cli(capsys, "info", target)[1]
+    assert facts["unit"] is None and "unit" not in table
+    assert f"[{data.min():g}, {data.max():g}]" in table, "as of volumes, not with all digits"
     code, out, err = run_cli(capsys, "convert", raw, target)
     assert code == 2 and err.count("\n") == 1 and "there is a store already" in err
     code, out, err = run_cli(
         capsys, "convert", raw, tmp_path / "b", "--workers", 2, "--scheduler", "tcp://x:1"
     )
     assert code == 2 and "leave --workers out" in err
+
+
+def test_an_estimate_has_the_workers_that_memory_allows(tmp_path, monkeypatch):
+    """As the conversion itself."""
+    data = gv.Volume(noise((300, 300, 8, 1)))
+    one, three = (estimate(data, tmp_path / "a.zarr", workers=n).memory_bytes for n in (1, 3))
+    assert estimate(data, tmp_path / "a.zarr", workers=3, memory=(one + three) // 2).workers == 2
+    assert estimate(data, tmp_path / "a.zarr", workers=3, memory=one).workers == 1
+    with pytest.raises(ValueError, match="is too little, one worker takes"):
+        estimate(data, tmp_path / "a.zarr", memory=one // 2)
+    monkeypatch.setattr("gvtorch.io.stores.conversion_plan.resources.memory_free", lambda: 1)
+    assert estimate(data, tmp_path / "a.zarr").workers == 1
 
 
 def test_estimate_is_near_the_truth(tmp_path):

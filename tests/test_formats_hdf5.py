@@ -230,6 +230,27 @@ def test_times_of_netcdf(tmp_path):
     assert np.array_equal(source.read_region((0, 0, 0), (3, 5, 6))[..., 0], data[2, :, ::-1])
 
 
+@pytest.mark.parametrize(
+    ("z_unit", "y_unit", "told"),
+    [
+        ("m", "degrees_north", "units of the axes (degrees_east, degrees_north, m)"),
+        ("hPa", "degrees_east", "units of the axes (degrees_east, hPa)"),
+        ("degrees", "degrees_north", ""),
+        ("m", "km", "units of the axes (degrees_east, km, m)"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_units_that_can_not_be_compared_are_told(tmp_path, z_unit, y_unit, told):
+    """The box of degrees and metres is as thin as their numbers say."""
+    cube = xarray.DataArray(noise((3, 5, 6), "float32"), dims=("z", "lat", "lon"), name="v")
+    for name, unit in (("z", z_unit), ("lat", y_unit), ("lon", "degrees_east")):
+        cube[name] = (name, 10.0 * np.arange(cube.sizes[name]), {"units": unit})
+    cube.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    source = open_source(tmp_path / "a.nc")
+    assert source.spacing == (10, 10, 10) and source.info.unit is None
+    assert [note.partition(":")[0] for note in source.dropped] == [told] * bool(told)
+
+
 def test_classic_netcdf_is_told(tmp_path):
     (tmp_path / "a.nc").write_bytes(b"CDF\1" + bytes(100))
     with pytest.raises(ValueError, match="classic kind; nccopy -k nc4"):

@@ -243,6 +243,8 @@ def test_fits_with_nan(tmp_path):
         ("a.tif", b"II*\0junk", "can't be read as TIFF"),
         ("a.fits", b"SIMPLE  = junk", "can't be read as FITS"),
         ("a.xyz", b"", "unknown volume format; known endings: ."),
+        ("a.obj.gz", b"", "not a volume: gvtorch voxelize makes one of a mesh"),
+        ("a.PLY", b"", "not a volume: gvtorch voxelize (or gvtorch splat, of points) makes one"),
     ],
 )
 @pytest.mark.filterwarnings("ignore")

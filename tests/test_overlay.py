@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import warnings
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ import gvtorch as gv
 from gvtorch.base.records import RenderStats
 from gvtorch.base.units import unit_symbol
 from gvtorch.pictures.files import write_png_rows
-from gvtorch.pictures.overlay import _labels, _round_below, _ticks
+from gvtorch.pictures.overlay import _labels, _length_text, _round_below, _ticks
+from gvtorch.tools.annotations import _color_bar
 
 Library("PIL")
 HOT = gv.TransferFunction.preset("hot", 0, 200)
@@ -65,6 +67,24 @@ def test_a_scale_bar_is_as_long_as_it_says():
         assert abs((columns[-1] - columns[0] + 1) * pixel - expected) < 2.5 * pixel
         assert columns[0] < 20 and rows[0] > 200, "at the lower left"
     assert [unit_symbol(u) for u in ("micrometer", "mm", "ly", None)] == ["µm", "mm", "ly", ""]
+
+
+@pytest.mark.parametrize(
+    ("length", "unit", "text"),
+    [
+        (2e-5, "m", "20 µm"),
+        (1e6, "nanometer", "1 mm"),
+        (5e-13, "meter", "0.5 pm"),
+        (20000.0, "angstrom", "2 µm"),
+        (5e6, "kilometer", "5e+06 km"),
+        (5000.0, "um", "5000 µm"),
+        (0.002, "mm", "0.002 mm"),
+        (1e-6, "parsec", "1e-06 parsec"),
+        (1e6, None, "1e+06"),
+    ],
+)
+def test_a_scale_bar_tells_few_digits(length, unit, text):
+    assert _length_text(length, unit) == text
 
 
 def test_a_pixel_is_as_wide_as_the_rays_are_apart():
@@ -153,6 +173,46 @@ def test_wrong_overlays_are_refused(make, message):
         make()
 
 
+def letters(text: str, **options) -> np.ndarray:
+    """Returns where letters are white, (h, w) bool."""
+    return (gv.Overlay(320, 240, text=text, **options).over(black()).color > 0.5).all(-1).numpy()
+
+
+@pytest.mark.parametrize("letter", ["\u00b5", "\u03bc", "\u00c5", "\u212b"])
+def test_units_of_microscopy_are_not_boxes(letter):
+    """A micro sign is a u with a stem below its left side, an angstrom an A with a ring above."""
+    plain = "u" if letter in "\u00b5\u03bc" else "A"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        drawn, base = letters(f"M{letter}m"), letters(f"M{plain}m")
+        unit = "micrometer" if plain == "u" else "angstrom"
+        gv.Overlay(320, 240, pixel=0.1, unit=unit)
+    assert drawn[base].all(), "the letter itself stays"
+    rows, columns = np.nonzero(drawn & ~base)
+    lines = np.flatnonzero(base.any(1))
+    baseline, top = lines[-1], np.flatnonzero(letters(f"{plain}").any(1))[0]
+    m_width = np.flatnonzero(letters("M").any(0))[-1]
+    assert columns.min() > m_width and columns.max() < np.flatnonzero(base.any(0))[-1] - 4
+    if plain == "u":
+        assert rows.max() >= baseline + 2 and np.ptp(columns) <= 2, "a thin stem"
+    else:
+        assert rows.max() <= top and 2 <= top - rows.min() <= 5, "a ring on its top"
+
+
+def test_black_ink_is_for_light_pictures():
+    bar = gv.ColorBar(colors=HOT, low=0, high=200, title="HU")
+    for light, ink in ((0.0, "white"), (1.0, "black")):
+        drawn = gv.Overlay(320, 240, bar=bar, pixel=0.1, text="Mk", ink=ink).over(
+            black(light=light)
+        )
+        left = drawn.color[:, :160]  # without the bar's colours
+        assert float((left - light).abs().max()) > 0.99
+        rim = gv.Overlay(320, 240, pixel=0.1, text="Mk", ink=ink).over(black(light=1 - light))
+        assert 0.5 < float((rim.color - 1 + light).abs().max()) < 0.99, "the rim, nearly as light"
+    with pytest.raises(ValueError, match="Overlay: ink must be 'white' or 'black', got 'red'"):
+        gv.Overlay(320, 240, ink="red")
+
+
 def test_letters_that_the_font_lacks_are_told():
     with pytest.warns(UserWarning, match="the font of pictures has no 漢"):
         gv.Overlay(320, 240, text="漢 a")
@@ -188,6 +248,23 @@ def test_render_and_fly_draw(scan_store, tmp_path, monkeypatch):
         run = gvtorch("render", scan_store, "-o", tmp_path / "c.png", "--size", "200x160", *more)
         assert run.returncode == 2 and message in run.stderr, run.stderr
     assert not (tmp_path / "c.png").exists()
+
+
+@pytest.mark.backend("cpp")
+@pytest.mark.parametrize(
+    ("background", "ink"), [("0.9,1,0.9", 0), ("1,1,1/0.5,0.6,0.8", 0), ("0.1,0.1,0.1", 255)]
+)
+def test_ink_stands_out_from_the_background(small, tmp_path, background, ink):
+    flags = ("--background", background, "--annotate", "Mk", "--size", "480x400")
+    assert gvtorch("render", small, "-o", tmp_path / "a.png", *flags).returncode == 0
+    corner = pixels((tmp_path / "a.png").read_bytes())[:40, :80].astype(int)
+    assert (abs(corner - ink).max(-1) < 60).sum() > 20
+
+
+def test_a_title_tells_the_same_once():
+    info = gv.ImageInfo(channels=(gv.ChannelInfo(name="density"),), quantity="density")
+    assert _color_bar(HOT, info, 0).title == "density"
+    assert _color_bar(gv.Filtered(gv.Lit(HOT)), info, 0).colors is HOT
 
 
 @pytest.mark.backend("cpp")

@@ -8,6 +8,7 @@ import torch
 from helpers import gvtorch
 
 import gvtorch as gv
+from gvtorch.pictures.letters import _GLYPH_ROWS
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +207,34 @@ def test_letters_stand_at_the_edges_and_nowhere_else():
     assert not gv.slice_picture(small, **options, letters=True).color.any()
 
 
+def test_letters_of_three_planes_have_one_size():
+    """Also if one of the planes is narrow: a dot is a pixel, as for the narrowest."""
+    body = gv.Volume(np.zeros((330, 330, 60), np.float32), info=gv.ImageInfo(space=RAS))
+    image = gv.slice_picture(body, "all", 0.5, span=(0, 1), radiological=True, letters=True).color
+    dots = {name: sum(row.bit_count() for row in rows) for name, rows in _GLYPH_ROWS.items()}
+    white = (image == 1).all(2)
+    coronal, sagittal, axial = white[:330, :60], white[:330, 64:], white[334:, :60]
+    for plane, letters in ((coronal, "SLIR"), (sagittal, "SPIA"), (axial, "ALPR")):
+        assert int(plane.sum()) == sum(dots[letter] for letter in letters)
+
+
+def test_labels_have_the_colours_of_labels(tmp_path):
+    """Also wide ones, of which voxels hold indices; the command leaves the background black."""
+    labels = np.zeros((3, 4, 5), np.int64)
+    labels[0, 1], labels[0, 2] = 70000, 2**40
+    volume = gv.Volume(labels, labels=True)
+    looks = gv.Labels({70000: (1.0, 0.0, 0.0)})
+    plane = gv.slice_picture(volume, "z", 0, colors=looks).color
+    assert torch.equal(plane[1], torch.tensor([[1.0, 0.0, 0.0]]).expand(5, 3))
+    assert np.allclose(plane[2].numpy(), looks(np.array([2**40]))[0, :3])
+    gv.convert(volume, tmp_path / "l.zarr")
+    out = tmp_path / "a.npz"
+    assert gvtorch("slice", tmp_path / "l.zarr", "-o", out, "--position", "0").returncode == 0
+    drawn = np.load(out)["color"]
+    assert np.allclose(drawn[1:3, 0], gv.Labels()(labels[0, 1:3, 0])[:, :3])
+    assert not drawn[0].any() and not drawn[3].any()
+
+
 @pytest.mark.parametrize(
     ("space", "options", "message"),
     [
@@ -227,6 +256,9 @@ def test_the_command_shows_patients(tmp_path):
     out = tmp_path / "a.png"
     run = gvtorch("slice", tmp_path / "a.nii", "-o", out)
     assert run.returncode == 0 and "axial: right is on the left" in run.stdout
+    run = gvtorch("slice", tmp_path / "a.nii", "-o", tmp_path / "c.png", "--axis", "all")
+    assert run.returncode == 0
+    assert "coronal and axial: right is on the left, sagittal: front is on the left" in run.stdout
     run = gvtorch("slice", tmp_path / "a.nii", "-o", tmp_path / "b.png", "--plain")
     assert run.returncode == 0 and out.read_bytes() != (tmp_path / "b.png").read_bytes()
 

@@ -66,6 +66,29 @@ def test_a_ball_has_the_area_and_the_volume_of_a_ball(monkeypatch, block):
     assert np.abs(radius - 14.3).max() < 0.02, "distances are linear but for the curvature"
 
 
+def test_signed_distances_are_solid_below(tmp_path):
+    """Level sets and distances to meshes grow outwards: the same triangles, the same picture."""
+    solid = ball()
+    info = gv.ImageInfo(quantity="signed distance")
+    distances = gv.Volume(-solid.data, solid.spacing, solid.origin, info=info)
+    store = gv.convert(distances, tmp_path / "d.zarr")
+    expected = gv.extract_surface(solid, -1.5)
+    for data in (distances, store):
+        mesh = gv.extract_surface(data, 1.5)
+        assert np.array_equal(triangles(mesh), triangles(expected))
+        assert area_and_volume(mesh)[1] > 0
+    for flags in (("--shader", "isosurface", "--value", "0"), ()):
+        out = tmp_path / "a.npz"
+        run = gvtorch("render", tmp_path / "d.zarr", "-o", out, "--size", "64x64", *flags)
+        assert run.returncode == 0, run.stderr
+        camera = gv.Camera.orbit(30, 20, fit=True, width=64, height=64)
+        picture = gv.render(solid, camera, gv.Isosurface(0.0))
+        assert torch.equal(torch.from_numpy(np.load(out)["alpha"]), picture.alpha)
+    assert isinstance(gv.view(distances, wait=False, browser=False).state.shader, gv.DistanceField)
+    with pytest.raises(ValueError, match="no surface at value -99"):
+        gv.extract_surface(distances, -99.0)
+
+
 def test_a_torus_has_a_hole_and_a_shell_two_sides():
     z, y, x = np.mgrid[:32, :32, :32] - 15.6
     torus = 4 - np.hypot(np.hypot(x, y) - 9, z)

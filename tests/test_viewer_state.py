@@ -46,6 +46,28 @@ OPTIONS = gv.RenderOptions(
 EYE = Eye(eye=(0, 0, 9), target=(0, 0.5, 0), up=(0, 1, 0), fov=20, model="ortho")
 
 
+@pytest.mark.parametrize(
+    ("space", "up", "front"),
+    [
+        ("right-anterior-superior", (0, 0, 1), 1),
+        ("left-posterior-superior", (0, 0, 1), -1),
+        (None, (0, 1, 0), None),
+    ],
+)
+def test_patients_are_first_seen_upright_and_from_the_front(space, up, front):
+    """As `gvtorch render` shows them."""
+    scan = gv.Volume(np.zeros((9, 8, 7), np.float32), info=gv.ImageInfo(space=space))
+    viewer = gv.view(scan, HOT, wait=False, browser=False)
+    eye = viewer.state.camera
+    viewer.close()
+    assert np.allclose(eye.up, up)
+    if front is not None:
+        assert front * (eye.eye[1] - eye.target[1]) > 5, "+y is the front, or the back"
+    turned = gv.view(scan, HOT, up="+x", wait=False, browser=False)
+    assert np.allclose(turned.state.camera.up, (1, 0, 0))
+    turned.close()
+
+
 @pytest.mark.parametrize("shader", SHADERS, ids=lambda one: type(one).__name__)
 def test_a_state_comes_back_from_its_json(shader):
     state = gv.ViewState(

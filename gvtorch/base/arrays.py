@@ -85,7 +85,7 @@ class ArrayLike:
         names, steps, units, dropped = _axis_metadata(array, len(shape))
         axis_letters = None if axes else named_axes(names, shape)
         axis_letters = axis_letters or ask_axes(context, shape, axes)
-        placement, info_fields = axes_placement(axis_letters, shape, steps, units)
+        placement, info_fields = axes_placement(axis_letters, shape, steps, units, dropped)
         attrs = _attributes(array)
         # A NaN differs from itself: it packs nothing.
         packing = [n for n in _PACKING_ATTRIBUTES if n in attrs and np.any(attrs[n] == attrs[n])]

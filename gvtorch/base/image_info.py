@@ -69,6 +69,10 @@ def array_from_srgb(color: np.ndarray) -> np.ndarray:
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
+#: `ImageInfo.quantity` of level sets and distances to meshes: world units, negative inside.
+SIGNED_DISTANCE = "signed distance"
+
+
 @dataclass(frozen=True, kw_only=True)
 class ImageInfo:
     """What is known about an image's values; what a file does not say keeps its default."""
@@ -113,3 +117,13 @@ class ImageInfo:
             info["time step"] = f"{self.time_step:g} {self.time_unit or ''}".strip()
         info["channel info"] = {str(n): c.describe() for n, c in enumerate(self.channels)}
         return {name: value for name, value in info.items() if value}
+
+
+def up_and_front(space: str | None) -> tuple[str, float]:
+    """Returns the up direction and the azimuth of the front, given where x, y and z point
+    (`ImageInfo.space`): for patients, the directions of the head and of the face.
+    """
+    axes = (space or "").split("-")
+    if len(axes) == 3 and axes[2] == "superior" and axes[1] in ("anterior", "posterior"):
+        return "+z", 180.0 if axes[1] == "anterior" else 0.0
+    return "+y", 0.0

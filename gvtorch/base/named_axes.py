@@ -88,10 +88,15 @@ def even_steps(name: str, coordinates: Any, dropped: list[str]) -> tuple[float, 
 
 
 def axes_placement(
-    axes: str, shape: Sequence[int], steps: Steps, units: Sequence[str | None]
+    axes: str,
+    shape: Sequence[int],
+    steps: Steps,
+    units: Sequence[str | None],
+    dropped: list[str],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Returns spacing, origin and flips of a grid from the coordinates along its axes, and the
-    unit, time_step, time_origin and time_unit of its `ImageInfo`.
+    unit, time_step, time_origin and time_unit of its `ImageInfo`. Units of x, y and z that can't be
+    compared are added to `dropped`, the metadata that is not kept.
     """
     by_letter = dict(zip(axes, zip(steps, units, shape, strict=True), strict=True))
     xyz_axes = [by_letter.get(letter, (None, None, 1)) for letter in "xyz"]
@@ -102,6 +107,10 @@ def axes_placement(
     if unit is None or lacks_unit:  # degrees, pressure levels, ...: no common unit of length
         unit, (x, y, z) = None, (size or 1.0 for size in sizes)
         spacing = (x, y, z)
+        told = [told_unit for step, told_unit, _ in xyz_axes if step and told_unit]
+        if len({length_unit(name) or name[:6] for name in told}) > 1:  # not degrees_north and _east
+            listing = ", ".join(dict.fromkeys(told))
+            dropped.append(f"units of the axes ({listing}): spacings are their plain numbers")
     origin, flips = [0.0, 0.0, 0.0], ""
     for axis, (step, _, count) in enumerate(xyz_axes):
         if step:

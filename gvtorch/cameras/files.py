@@ -201,6 +201,8 @@ def _pvcc_text(cameras: Mapping[str, Camera], distance: float) -> str:
 
 def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[str, Camera]:
     content = check.json_file("cameras", path)
+    if not isinstance(content, dict):  # such as the keys of a flight
+        raise ValueError("must be an object with frames")
     cameras = {}
     for number, frame in enumerate(content["frames"]):
         fields = {**content, **frame}

@@ -21,7 +21,7 @@ import torch
 
 from ..base import check
 from ..base.boxes import box_of
-from ..base.image_info import PREMULTIPLIED, ImageInfo
+from ..base.image_info import PREMULTIPLIED, SIGNED_DISTANCE, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..meshes.holes import SolidParts, warn_of_holes
 from ..meshes.mesh import Material, Mesh
@@ -77,6 +77,7 @@ class MeshSource(VolumeSource):
             dtype, width = CHANNELS[channel]
             x, y, z = voxelizer.extent
             colors = PREMULTIPLIED if channel == "color" else ()
+            quantity = SIGNED_DISTANCE if channel == "distance" else channel
             sources[channel] = cls(
                 path=name,
                 shape=(z, y, x, width),
@@ -84,7 +85,7 @@ class MeshSource(VolumeSource):
                 stored=str(dtype).removeprefix("torch."),
                 spacing=(voxelizer.spacing,) * 3,
                 origin=voxelizer.origin,
-                info=ImageInfo(channels=colors, quantity=channel, labels=channel == "material"),
+                info=ImageInfo(channels=colors, quantity=quantity, labels=channel == "material"),
                 channel=channel,
                 settings=tuple(voxelizer.settings.items()),
                 solid=solid,

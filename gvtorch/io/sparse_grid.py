@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base import boxes
-from ..base.image_info import ChannelInfo, ImageInfo
+from ..base.image_info import SIGNED_DISTANCE, ChannelInfo, ImageInfo
 from .source import Index, VolumeSource, place_axes
 
 SIDES = (4096, 128, 8)  # voxels along a side of an upper node, a lower node and a leaf
@@ -33,7 +33,7 @@ _BATCH_LEAVES = 4096
 # Voxels of the whole leaves around a thin box, above which it is filled in pieces.
 _MAX_PADDED_VOXELS = 1 << 22
 _LOCK = threading.Lock()
-_QUANTITIES = {"level set": "signed distance", "fog volume": "density"}
+_QUANTITIES = {"level set": SIGNED_DISTANCE, "fog volume": "density"}
 
 
 @dataclass(kw_only=True)

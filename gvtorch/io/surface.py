@@ -18,6 +18,7 @@ import torch
 
 from ..base import check
 from ..base.boxes import clamped_box, repeat_edges
+from ..base.image_info import SIGNED_DISTANCE
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, to_numpy
 from ..meshes.contour import contour, edge_of
@@ -49,7 +50,8 @@ def extract_surface(
     progress: Progress = no_progress,
 ) -> Mesh:
     """Returns the surface around values of at least `value`, or around one label, as triangles in
-    world units; see `export_surface` for one larger than memory.
+    world units; see `export_surface` for one larger than memory. The surface of a volume or a store
+    of signed distances (`ImageInfo.quantity`) is around values of at most `value`.
 
     Args:
         what: A volume; a store, of which a block is read at a time; or a resident tree.
@@ -63,7 +65,7 @@ def extract_surface(
         progress: Called with ("surface", blocks done, blocks in all).
 
     Returns:
-        Triangles, counter-clockwise seen from lower values; every edge belongs to two triangles,
+        Triangles, counter-clockwise seen from outside; every edge belongs to two triangles,
         except where an open surface ends. Where a voxel is `value` exactly, some have no area.
 
     Raises:
@@ -136,7 +138,11 @@ class _Grid:
             raise ValueError(f"{caller}: what must be a Volume, Store or N3Tree, got {kind}")
         self.source, self.margin = source, 2 if caps else 0
         self.label: int | None = None
-        self.value = check.number(caller, "value", value)
+        is_distance = isinstance(source, (Volume, Store)) and (
+            source.info.quantity == SIGNED_DISTANCE
+        )
+        self._sign = -1 if is_distance else 1  # signed distances grow outwards
+        self.value = self._sign * check.number(caller, "value", value)
         branching, levels = 2, source.levels if isinstance(source, Store) else 1
         if isinstance(source, N3Tree):
             branching, levels = source.branching, source.depth + 1
@@ -171,13 +177,13 @@ class _Grid:
         return (self._first_center + voxels * self.step)[:, ::-1]
 
     def read(self, low: Sequence[int], high: Sequence[int]) -> np.ndarray:
-        """Returns samples low to high, float64; outside they are -inf."""
+        """Returns samples low to high, float64, which grow inwards; outside they are -inf."""
         begin, end = ([n - self.margin for n in corner] for corner in (low, high))
         start, stop = clamped_box(begin, end, self.voxels)
         values = self._voxels(start, stop)[..., self.component, None]
         values = repeat_edges(values, start, begin, end)[..., 0]
         scalars = values == self.label if self.label is not None else values
-        samples = scalars.astype(np.float64)
+        samples = self._sign * scalars.astype(np.float64)
         samples[np.isnan(samples)] = -np.inf
         for axis in range(3 if self.margin else 0):
             layer = np.arange(low[axis], high[axis])
@@ -207,14 +213,15 @@ class _Grid:
         start, stop = clamped_box(begin, end, self.voxels)
         first, last = [n // CELL for n in start], [-(-n // CELL) for n in stop]
         cells = store.read_cells(self.level, first, last)[..., self.component]
-        lowest, highest = cells[..., 0].min(), cells[..., 1].max()
+        ends_of_range = float(cells[..., 0].min()), float(cells[..., 1].max())
+        lowest, highest = sorted(self._sign * end for end in ends_of_range)
         if self.label is not None:
             return bool(lowest <= self.label <= highest and (lowest < highest or outside))
         return bool(highest >= self.value and (lowest < self.value or outside))
 
     def no_surface_message(self) -> str:
         """Returns the message for data without a surface."""
-        target = f"value {self.value:g}" if self.label is None else "that label"
+        target = f"value {self._sign * self.value:g}" if self.label is None else "that label"
         return f"extract_surface: the data has no surface at {target}"
 
 

@@ -16,14 +16,15 @@ _GLYPH_ROWS = {
 _MIN_SIDE = 40  # pixels: a smaller plane has no room
 
 
-def draw_letters(image: np.ndarray, letters: str) -> None:
+def draw_letters(image: np.ndarray, letters: str, shortest_side: int) -> None:
     """Draws four letters into an image (h, w, 3), white on black: at its top, right, bottom and
-    left edge. An image without room for them stays as it is.
+    left edge. An image without room for them stays as it is. The letters' size follows the shortest
+    side (pixels) of the images that are shown together.
     """
     height, width, _ = image.shape
     if min(height, width) < _MIN_SIDE:
         return
-    size = max(1, min(height, width) // 160)  # pixels of a dot
+    size = max(1, shortest_side // 160)  # pixels of a dot
     for edge, letter in zip(((0, 1), (1, 2), (2, 1), (1, 0)), letters, strict=True):
         dots = np.array([[row >> (4 - bit) & 1 for bit in range(5)] for row in _GLYPH_ROWS[letter]])
         stamp = np.pad(dots, 1).repeat(size, 0).repeat(size, 1).astype(image.dtype)

@@ -16,7 +16,7 @@ from ..base import check
 ToneCurve = Literal["none", "reinhard", "aces"]
 CURVES: tuple[ToneCurve, ...] = get_args(ToneCurve)
 _MOST_LIGHT = 1e9  # its square fits into float32
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB with the primaries of Rec. 709
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear RGB with the primaries of Rec. 709
 
 
 def tone_map(
@@ -29,7 +29,7 @@ def tone_map(
     white = check.number("tone_map", "white", white, low=1 / _MOST_LIGHT, high=_MOST_LIGHT)
     color = (finite(color) * 2.0**stops).clamp(max=_MOST_LIGHT)
     if curve == "reinhard":
-        weights = torch.stack([torch.full_like(color[..., 0], w) for w in _LUMINANCE], -1)
+        weights = torch.stack([torch.full_like(color[..., 0], w) for w in LUMINANCE], -1)
         light = (color * weights).sum(-1, keepdim=True)
         color = color * ((1 + light / white**2) / (1 + light))
     elif curve == "aces":

@@ -16,6 +16,11 @@ if TYPE_CHECKING:
     from ..viewer.state import ViewState
 
 
+_EQUAL_CONTRAST = (
+    0.18  # luminance, linear: black and white differ from it by the same factor (WCAG)
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Annotations:
     """What is drawn over the picture."""
@@ -48,7 +53,23 @@ class Annotations:
             pixel=camera.pixel_width(math.dist(eye.eye, eye.target)) if self.scale_bar else None,
             unit=info.unit,
             text=self.annotate,
+            ink="black" if _is_light(state.options.background) else "white",
         )
+
+
+def _is_light(background: object) -> bool:
+    """Returns whether black stands out more than white from a background: from its colour, or both
+    ends of its gradient.
+    """
+    import numpy as np
+
+    from ..pictures import Gradient
+    from ..pictures.tone import LUMINANCE
+
+    colors = background.ends if isinstance(background, Gradient) else [background]
+    return all(
+        isinstance(color, tuple) and np.dot(color, LUMINANCE) > _EQUAL_CONTRAST for color in colors
+    )
 
 
 def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
@@ -60,5 +81,5 @@ def _color_bar(shader: Shader, info: ImageInfo, component: int) -> ColorBar:
         raise ValueError(f"--bar is for transfer functions, not for {type(shader).__name__}")
     values = [*transfer.opacity[:, 0], *transfer.color[:, 0]]
     names = [info.channels[component].name] if component < len(info.channels) else []
-    title = ", ".join(part for part in (*names, info.quantity) if part)
+    title = ", ".join(dict.fromkeys(part for part in (*names, info.quantity) if part))
     return ColorBar(colors=transfer, low=min(values), high=max(values), title=title)

@@ -110,6 +110,7 @@ class Convert:
 
         self.conversion.check()
         arguments: dict[str, Any] = {**self.source.options(), "threshold": self.threshold}
+        arguments["memory"] = self.memory
         if self.dry_run:
             from ..base import check
             from ..io.stores.unfinished import is_begun
@@ -122,7 +123,7 @@ class Convert:
             return
         start, was_finished = time.perf_counter(), (self.store / "zarr.json").exists()
         with self.conversion.arguments(speed=True) as store_options:
-            store = convert(self.path, self.store, **arguments, memory=self.memory, **store_options)
+            store = convert(self.path, self.store, **arguments, **store_options)
         if was_finished:  # --resume had nothing to do
             print(f"{printable(self.store)}: is finished already")
             return
@@ -224,12 +225,17 @@ def _print_table(content: dict[str, Any]) -> None:
         elif isinstance(value, dict):
             text = "\n".join(printable(f"{key}: {item}") for key, item in value.items())
         elif isinstance(value, (list, tuple)):
-            items = (f"{n:g}" if isinstance(n, float) else printable(n) for n in value)
-            text = ", ".join(items)
+            text = ", ".join(map(_cell_text, value))
         else:
-            text = f"{value:g}" if isinstance(value, float) else printable(value)
+            text = _cell_text(value)
         table.add_row(Text(name, "bold"), Text(text))
     Console().print(table)
+
+
+def _cell_text(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_cell_text, value))}]"
+    return f"{value:g}" if isinstance(value, float) else printable(value)
 
 
 def _sparkline(counts: list[int]) -> str:

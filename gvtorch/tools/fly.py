@@ -17,12 +17,13 @@ from tyro.conf import Positional
 
 from ..base.declared import declared_names
 from ..base.digits import whole_number
+from ..base.image_info import up_and_front
 from ..base.messages import printable
 from ..base.whole_file import write_text
 from ..io.stores.ngff import is_zarr
 from .annotations import Annotations
 from .common import Bar, check_outputs, given_flags, option, parse_size, volume_formats
-from .look import default_orbit, parse_camera, parse_orbit, up_and_front
+from .look import default_orbit, parse_camera, parse_orbit
 from .scene import RenderedScene, SceneFlags
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..base.declared import declared_names, declared_texts
+from ..base.image_info import SIGNED_DISTANCE, up_and_front
 from .common import given_flags, option, parse_numbers
 from .parse import (
     parse_background,
@@ -89,7 +90,8 @@ class Look:
     # window; parts left out or auto come from the file, or are chosen; the item opacity makes
     # channels hide each other instead of adding up
     channel: Annotated[str | None, option(metavar="N:COLOR:LO,HI;...")] = None
-    # value of the surface, for --shader isosurface
+    # value of the surface, for --shader isosurface; signed distances (level sets, and --channel
+    # distance of gvtorch voxelize) are solid below it, and shown so at 0 without --tf and --window
     value: Annotated[float | None, option(metavar="VALUE")] = None
     # distance between samples along a ray, in voxels of the finest level
     step: Annotated[float, option(metavar="VOXELS")] = 0.5
@@ -208,9 +210,10 @@ class Look:
 
     def make_shader(self, data: Volume | Store) -> Shader:
         """Returns the shader that the flags choose, with its transfer function read from a file or
-        stretched over the data; `Labels` for data that holds labels.
+        stretched over the data; `Labels` for data that holds labels, and the surface of signed
+        distances.
         """
-        from ..shaders import Filtered, Labels, Lit, TransferFunction
+        from ..shaders import DistanceField, Filtered, Isosurface, Labels, Lit
         from ..shaders.built_in import named_shader
 
         if self.shader == "channels":
@@ -226,12 +229,15 @@ class Look:
             return Labels()
         if (self.value is None) == (self.shader == "isosurface"):
             raise ValueError("--value and --shader isosurface belong together")
-        if self.shader == "isosurface":
+        is_distance = data.info.quantity == SIGNED_DISTANCE
+        is_default = (self.shader, self.tf, self.window) == ("plain", None, None)
+        if self.shader == "isosurface" or (is_distance and is_default):
             for flag, value in (("--tf", self.tf), ("--window", self.window)):
                 if value is not None:
                     raise ValueError(f"{flag} is for values: an isosurface has one")
             data.info.check_component("--component", self.component, data.width)
-            return named_shader(self.shader, TransferFunction([(0, 1)]), self.value or 0.0)
+            level = self.value or 0.0
+            return DistanceField(offset=level) if is_distance else Isosurface(level)
         _warn_of_other_channels(data, self.component)
         transfer = parse_transfer(self.tf, self.window, data, self.component)
         if self.shader in ("filtered", "filtered-lit"):  # its colours are made with the tree
@@ -262,16 +268,6 @@ def parse_orbit(flag: str, text: str) -> tuple[float, float, float | None]:
         raise ValueError(f"{flag} must be AZ,EL or AZ,EL,DIST, got {text!r}")
     azimuth, elevation, *distance = parse_numbers(flag, numbers, count, float)
     return azimuth, elevation, distance[0] if distance else None
-
-
-def up_and_front(space: str | None) -> tuple[Up, float]:
-    """Returns the up direction and the azimuth of the front, given where x, y and z point
-    (`ImageInfo.space`): for patients, the directions of the head and of the face.
-    """
-    axes = (space or "").split("-")
-    if len(axes) == 3 and axes[2] == "superior" and axes[1] in ("anterior", "posterior"):
-        return "+z", 180.0 if axes[1] == "anterior" else 0.0
-    return "+y", 0.0
 
 
 def default_orbit(space: str | None) -> str:

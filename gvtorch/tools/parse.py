@@ -91,6 +91,7 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
         return Channels.of(image)
     items = [item.strip() for item in text.split(";")]
     number_of = {c.name: str(number) for number, c in enumerate(image.info.channels) if c.name}
+    known = f"; the channels are {', '.join(number_of)}" if number_of else ""
     settings_by_number: dict[int, list[str]] = {}
     for item in items:
         name, *settings = item.split(":")
@@ -100,7 +101,7 @@ def parse_channels(text: str | None, image: Volume | Store) -> Channels:
         if number is None or len(settings) > 2:
             raise ValueError(
                 "--channel must hold NUMBER:COLOR:LO,HI, or a name for the number, where what is "
-                f"left out or auto is the image's, or opacity; got {item!r}"
+                f"left out or auto is the image's, or opacity; got {item!r}{known}"
             )
         if number in settings_by_number:
             raise ValueError(f"--channel names channel {number} twice")

@@ -38,7 +38,7 @@ class Slice:
     scale: Annotated[float, option(metavar="PIXELS")] = 1.0
     # level of detail of a store; 0 is the finest
     level: Annotated[int, option(metavar="N")] = 0
-    # colours, as in gvtorch render; if left out: visually even grays
+    # colours, as in gvtorch render; if left out: visually even grays, or those of labels
     tf: Annotated[str | None, option(metavar="FILE|PRESET")] = None
     # values that the colours span, as in gvtorch render; auto includes the background
     window: Annotated[str | None, option(metavar="LO,HI")] = None
@@ -52,6 +52,7 @@ class Slice:
 
     def run(self) -> None:
         from ..pictures.files import checked_path
+        from ..shaders import Labels, TransferFunction
         from ..tracing import slice_picture
         from ..tracing.slices import radiological_views
 
@@ -66,8 +67,11 @@ class Slice:
             bar("reading", 0, 0)
             data = open_data(self.path, self.source, image=self.image, level=self.level)
             views = radiological_views(data.info.space) if self.up is None else {}
-            span, colors = None, None
-            if self.tf is None:
+            span: tuple[float, float] | None = None
+            colors: Labels | TransferFunction | None = None
+            if data.info.labels and self.tf is None and self.window is None:
+                colors = Labels({0: (0.0, 0.0, 0.0)})
+            elif self.tf is None:
                 text = "auto" if self.window is None else self.window
                 span = parse_window(text, data, self.component, background=True)
             else:
@@ -86,6 +90,10 @@ class Slice:
             )
         height, width, _ = picture.color.shape
         picture.save(self.output, bits=self.bits)
-        names = [view.name for axis, view in views.items() if self.axis in (axis, "all")]
-        note = f", {' and '.join(names)}: right is on the left" if names else ""
+        shown = [view for axis, view in views.items() if self.axis in (axis, "all")]
+        note = "".join(
+            f", {' and '.join(names)}: {side} is on the left"
+            for letter, side in (("R", "right"), ("A", "front"))
+            if (names := [view.name for view in shown if view.letters.endswith(letter)])
+        )
         print(f"{printable(self.output)}: {width}x{height}{note}")

@@ -22,7 +22,8 @@ class Surface:
     path: Positional[Annotated[str, option(metavar="PATH", help=f"a volume: {volume_formats()}")]]
     # mesh to write, in world units: PLY, or binary glTF
     output: Annotated[Path, option(aliases=["-o"], metavar="OUT.ply|OUT.glb")]
-    # surface around values of at least this; for labels: the label to enclose
+    # surface around values of at least this (at most, for signed distances); for labels: the label
+    # to enclose
     value: Annotated[float, option(aliases=["--iso"], metavar="VALUE")]
     # level of detail of a store; 0 is the finest, each next one has a quarter of the triangles
     level: Annotated[int, option(metavar="N")] = 0

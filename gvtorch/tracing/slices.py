@@ -7,7 +7,7 @@ voxels of the plane are read.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from ..io.stores.store import Store
 from ..io.window import window
 from ..pictures.letters import draw_letters
 from ..pictures.picture import Picture
+from ..shaders.labels import Labels
 from ..shaders.presets import display_grays
 from ..shaders.transfer_function import TransferFunction
 
@@ -71,7 +72,8 @@ def slice_picture(
             (0, 255), the values of 8-bit voxels are their sRGB numbers. If left out, what `window`
             finds, with the background.
         colors: Instead of grays, the colours of values (not their opacity): a transfer function,
-            `Labels`, or another function from values (...) to linear red, green, blue (..., 3).
+            `Labels`, or another function from values (...) to linear red, green, blue (..., 3). Of
+            wide labels voxels hold indices: `Labels` is given the labels, others the indices.
         component: Which number of a voxel.
         level: Level of a store; 0 is the finest.
         scale: Pixels along the shortest side of a voxel.
@@ -101,13 +103,24 @@ def slice_picture(
             raise ValueError(f"{_NAME}: position must be {wanted}, got {position!r}")
         position_of = dict(zip("xyz", positions, strict=True))
         pixel = min(reader.spacing.values()) / scale
-        planes = (reader.colored(n, position_of[n], views[n], pixel, colors) for n in "xyz")
+        planes = [reader.colored(n, position_of[n], views[n], pixel, colors) for n in "xyz"]
+        _draw_all_letters(planes, [views[n] for n in "xyz"])
         return _picture(_arranged(*planes))
     if isinstance(position, tuple):
         raise ValueError(f"{_NAME}: position must be one for axis {axis}, got {position!r}")
     pixel = min(reader.spacing[n] for n in "xyz" if n != axis) / scale
     view = views[axis] if up is None else PlaneView("", up)
-    return _picture(reader.colored(axis, position, view, pixel, colors))
+    plane = reader.colored(axis, position, view, pixel, colors)
+    _draw_all_letters([plane], [view])
+    return _picture(plane)
+
+
+def _draw_all_letters(planes: Sequence[np.ndarray], views: Sequence[PlaneView]) -> None:
+    """Draws the letters of planes that are shown together, all of one size."""
+    shortest_side = min(side for plane in planes for side in plane.shape[:2])
+    for plane, view in zip(planes, views, strict=True):
+        if view.letters:
+            draw_letters(plane, view.letters, shortest_side)
 
 
 def _colors(
@@ -124,7 +137,10 @@ def _colors(
     if not callable(colors) or isinstance(colors, type):
         kind = type(colors).__name__
         raise ValueError(f"{_NAME}: colors must be a function of values or Labels, got a {kind}")
-    return colors
+    if data.label_values is None or not isinstance(colors, Labels):
+        return colors
+    labels, looks = to_numpy(data.label_values), colors
+    return lambda indices: looks(labels[indices])  # which the voxels hold
 
 
 def _views(
@@ -279,10 +295,7 @@ class _PlaneReader:
             raise ValueError(f"slice_picture: colors must return {wanted}, got {got}")
         nbytes = len(rows) * len(columns) * colored.shape[2] * colored.itemsize
         check.memory("slice_picture", "the picture", nbytes, torch.device("cpu"))
-        image = colored[np.ix_(rows, columns)][..., :3]
-        if view.letters:
-            draw_letters(image, view.letters)
-        return image
+        return colored[np.ix_(rows, columns)][..., :3]
 
 
 def _voxel_of_pixels(count: int, size: float) -> np.ndarray:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..base.arrays import as_volume
-from ..base.image_info import ImageInfo
+from ..base.image_info import SIGNED_DISTANCE, ImageInfo
 from ..base.stage import Progress, no_progress
 from ..base.volume import Volume, movable, to_numpy
 from ..cameras import Camera
@@ -29,7 +29,7 @@ from ..ops.registry import device_of
 from ..pictures import Picture
 from ..pool import N3Tree
 from ..producers import Producer, StoredProducer, VolumeProducer
-from ..shaders import Channels, Labels, Shader, TransferFunction
+from ..shaders import Channels, DistanceField, Labels, Shader, TransferFunction
 from ..shaders.labels import label_rows
 from ..shaders.presets import IN_HU
 from ..tracing import cost, render
@@ -130,6 +130,8 @@ class Scene:
             return Labels()
         if 1 < data.width <= 16 and len(data.info.channels) == data.width:
             return Channels.of(data)
+        if data.info.quantity == SIGNED_DISTANCE:
+            return DistanceField()
         if data.info.quantity == "HU":
             return TransferFunction.preset(IN_HU["bone"])
         return TransferFunction.preset("gray", *window(data))

@@ -268,10 +268,7 @@ class Planes:
         """Returns the function that colours values; None: grays."""
         assert state.slices is not None
         if self.data.info.labels:
-            shader = state.shader if isinstance(state.shader, Labels) else Labels()
-            if (label_values := self.data.label_values) is None:
-                return shader
-            return lambda values: shader(label_values.numpy()[values])
+            return state.shader if isinstance(state.shader, Labels) else Labels()
         if state.slices.colors == "gray":
             return None
         return transfer_of(state.shader)

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from ..base import check
+from ..base.image_info import up_and_front
 from ..base.messages import one_line
 from ..base.records import RenderStats
 from ..base.whole_file import write_text
@@ -106,9 +107,15 @@ class Eye:
         return cls(**triples, fov=round(fov, 9), model=model)
 
     @classmethod
-    def first(cls, box: Tensor, width: int, height: int, up: Up = "+y") -> Self:
-        """Returns the default eye: it sees the whole (2, 3) box, in a picture of such a shape."""
-        camera = Camera.orbit(30, 20, width=width, height=height, up=up, fit=True)
+    def first(
+        cls, box: Tensor, width: int, height: int, up: Up | None = None, space: str | None = None
+    ) -> Self:
+        """Returns the default eye: it sees the whole (2, 3) box, in a picture of such a shape; a
+        patient, whom `ImageInfo.space` tells, upright and from the front.
+        """
+        default_up, front = up_and_front(space)
+        up = default_up if up is None else up
+        camera = Camera.orbit(front + 30, 20, width=width, height=height, up=up, fit=True)
         return replace(cls.of(camera, box), up=tuple(upward("view", up).tolist()))
 
     def fitted(self, box: Tensor, width: int, height: int) -> Self:
@@ -317,9 +324,13 @@ class ViewState:
 
 
 def transfer_of(shader: Shader) -> TransferFunction | None:
-    """Returns a shader's transfer function, which may be the shader itself, or None."""
-    transfer = getattr(shader, "transfer", None) or shader
-    return transfer if isinstance(transfer, TransferFunction) else None
+    """Returns a shader's transfer function, which may be the shader itself or that of the shader
+    which it filters, or None.
+    """
+    if isinstance(shader, TransferFunction):
+        return shader
+    inner = getattr(shader, "transfer", None)
+    return None if inner is None else transfer_of(inner)
 
 
 def costed(shader: Shader) -> TransferFunction:

@@ -97,7 +97,8 @@ def view(
         what: A path or URL, `Volume`, array, `Store`, `N3Tree`, `Producer` or several by name,
             `Engine`, or a function from a dataclass to a producer, whose fields become controls.
         shader: What turns values into colour; one that fits the data if left out.
-        camera: The first camera; one that sees the whole box if left out.
+        camera: The first camera; one that sees the whole box if left out, patients upright and
+            from the front.
         up: Up direction of a camera that is left out, such as "+z".
         state: A file that the page saved, or `Viewer.state`: replaces shader, camera and options.
         engine: Fields of `EngineOptions`, where an engine is made.
@@ -171,7 +172,7 @@ def new_session(
             chosen = state if isinstance(state, ViewState) else chosen.read(Path(state))
         if chosen.camera is None:
             if camera is None:
-                eye = Eye.first(scene.box, *ASPECT, up or "+y")
+                eye = Eye.first(scene.box, *ASPECT, up, scene.info.space)
             else:
                 eye = Eye.of(check.instance("view", "camera", camera, Camera), scene.box)
             chosen = replace(chosen, camera=eye)

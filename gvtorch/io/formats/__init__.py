@@ -25,6 +25,12 @@ def find_format(path: str, *, raw: bool = False) -> Format:
         return next(candidate for candidate in FORMATS if candidate.name == "RAW")
     if Path(path).is_dir():
         raise ValueError(f"{path}: holds no DICOM series, no images and no Zarr or N5 array")
+    from ..mesh_file import ENDINGS as MESHES
+
+    ending = path.lower().removesuffix(".gz").rpartition(".")[2]
+    if ending in MESHES:
+        points = " (or gvtorch splat, of points)" if ending == "ply" else ""
+        raise ValueError(f"{path}: not a volume: gvtorch voxelize{points} makes one of a mesh")
     endings = ", ".join(ending for candidate in FORMATS for ending in candidate.endings)
     raise ValueError(
         f"{path}: unknown volume format; known endings: {endings}, or a folder of DICOM files or "

@@ -148,7 +148,7 @@ def open_zarr_array(path: str, key: str | None = None, axes: str | None = None) 
                     steps[axis] = even_steps(name, unpack_coordinates(values, packing), dropped)
                     units[axis] = str(packing.get("units", "")) or None
     axis_order = axis_order or ask_axes(path, shape, axes)
-    placement, info_fields = axes_placement(axis_order, shape, steps, units)
+    placement, info_fields = axes_placement(axis_order, shape, steps, units, dropped)
     quantity = attributes.get("units")
     info = ImageInfo(quantity=quantity if isinstance(quantity, str) else None, **info_fields)
     placement |= cf_fields(np.dtype(source.stored), _with_fill_value(driver, metadata, attributes))

@@ -73,7 +73,7 @@ def open_hdf5(path: str, key: str | None = None, axes: str | None = None) -> Hdf
             dropped.append(f"{len(missing)} files that are not there, such as {missing[0]}")
         info = _info(dataset, axis_order, shape)
         value_fields = cf_fields(dataset.dtype, dataset.attrs)
-        placement, info_fields = axes_placement(axis_order, shape, steps, units)
+        placement, info_fields = axes_placement(axis_order, shape, steps, units, dropped)
         element_size = np.ravel(dataset.attrs.get("element_size_um", ())).tolist()
         if info_fields["unit"] is None and len(element_size) == 3:
             placement["spacing"], info_fields["unit"] = spacing_of(element_size[::-1], ["um"] * 3)

@@ -104,8 +104,8 @@ def convert(
     begun = unfinished.is_begun(target, resume=resume)
     prepared = indexed_source(make_source(), time, workers, target / WORK, progress)
     plan = plan_of(source, prepared, target, block, threshold, nan, time, workers)
-    if executor is None and (memory is not None or workers is None):
-        plan = fit_workers(plan, memory)
+    if executor is None:
+        plan = fit_workers(plan, memory, workers)
     if not begun:
         check_room(target, estimate_of(plan))
     _write_store(plan, begun, executor, progress)
@@ -164,6 +164,7 @@ def estimate(
     oblique: Oblique | None = None,
     labels: bool = False,
     workers: int | None = None,
+    memory: int | str | None = None,
     **options: Unpack[FormatSettings],
 ) -> Estimate:
     """Returns the estimated cost of `convert`, from a few cubes converted in memory. Writes
@@ -174,7 +175,8 @@ def estimate(
     target = Path(store)
     prepared = source_of(source, spacing, None, time, oblique, labels, options)
     prepared = indexed_source(prepared, time, workers, target / WORK, no_progress)
-    return estimate_of(plan_of(source, prepared, target, block, threshold, nan, time, workers))
+    plan = plan_of(source, prepared, target, block, threshold, nan, time, workers)
+    return estimate_of(fit_workers(plan, memory, workers))
 
 
 def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: Progress) -> None:

@@ -226,8 +226,12 @@ def _task_bytes(plan: Plan) -> tuple[int, int]:
     return fixed_bytes + int(copies * cube_fraction), source_bytes
 
 
-def fit_workers(plan: Plan, memory: int | str | None) -> Plan:
-    """Returns the plan with at most the workers that fit into `memory`; None: into free memory."""
+def fit_workers(plan: Plan, memory: int | str | None, workers: int | None) -> Plan:
+    """Returns the plan with at most the workers that fit into `memory`; None: into free memory, or
+    all of them if their number was given.
+    """
+    if memory is None and workers is not None:
+        return plan
     worker_bytes, source_bytes = _task_bytes(plan)
     free = resources.memory_free() + source_bytes
     limit = free if memory is None else check.nbytes("convert", "memory", memory)
