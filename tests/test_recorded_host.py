@@ -7,6 +7,7 @@ import math
 import threading
 import time
 import weakref
+from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import Any
 
@@ -16,7 +17,7 @@ from helpers import DEVICES
 from helpers.recorded import COMPILED, TRANSFER, Frames, view
 
 import gvtorch as gv
-from gvtorch.engine import host_frame, request_batch
+from gvtorch.engine import asker, host_frame
 from gvtorch.engine.upload_queue import UploadQueue
 from gvtorch.io.stores.conversion import convert
 
@@ -245,7 +246,7 @@ def test_a_batch_whose_frames_were_dropped_while_it_was_asked_for_is_not_waited_
         assert not frames.served._waiting, "its kind would count as busy"
 
 
-class Guarded(dict[Any, Any]):
+class Guarded(list[Any]):
     """Lists its methods that are called while nobody holds a lock."""
 
     def __init__(self, lock: threading.Lock) -> None:
@@ -253,19 +254,14 @@ class Guarded(dict[Any, Any]):
         self.lock, self.unlocked = lock, []
 
     def __getattribute__(self, name: str) -> Any:
-        if name in ("pop", "clear", "values", "items") and not self.lock.locked():
+        if name in ("append", "remove", "clear") and not self.lock.locked():
             self.unlocked.append(name)
         return super().__getattribute__(name)
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __iter__(self) -> Iterator[Any]:
         if not self.lock.locked():
-            self.unlocked.append("set")
-        super().__setitem__(key, value)
-
-    def __delitem__(self, key: Any) -> None:
-        if not self.lock.locked():
-            self.unlocked.append("delete")
-        super().__delitem__(key)
+            self.unlocked.append("iter")
+        return super().__iter__()
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -331,6 +327,31 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
 
 
 @pytest.mark.parametrize("backend", COMPILED)
+def test_several_batches_may_wait_for_one_future(blobs, backend, monkeypatch):
+    never: Future = Future()
+
+    class Shared(gv.VolumeProducer):
+        patience, calls = 0.3, 0
+
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            self.calls += 1
+            return never
+
+    monkeypatch.setattr(host_frame, "_CALL_GAP", 0.0)
+    producer = Shared(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 3)
+        while not never.done():
+            frames.frame()
+            frames.served._executor.submit(int).result()  # until its requests are passed on
+        assert producer.calls > 1
+        frames.whole(pause=0.01)
+        assert frames.served.pending == 0
+
+
+@pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("later", [False, True])
 def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
     blobs, later, backend, monkeypatch
@@ -346,7 +367,7 @@ def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
             answer.set_exception(RuntimeError("out of order"))
             return answer if later else answer.result()
 
-    monkeypatch.setattr(request_batch, "_MAX_RAISING_CALLS", 8)
+    monkeypatch.setattr(asker, "_MAX_RAISING_CALLS", 8)
     with gv.Engine(Never(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         frames = Frames(engine, view(48), TRANSFER, 64)
         while not calls:
