@@ -20,6 +20,7 @@ import gvtorch as gv
 from gvtorch.engine import asker, host_frame
 from gvtorch.engine.upload_queue import UploadQueue
 from gvtorch.io.stores.conversion import convert
+from gvtorch.pool.staging import BrickTable
 
 
 def on_the_host(blobs, tmp_path, kind: str) -> gv.Producer:
@@ -386,6 +387,45 @@ def test_a_batch_larger_than_memory_is_refused_before_it_is_allocated(monkeypatc
     monkeypatch.setattr("os.sysconf", lambda _: 1000)
     with pytest.raises(ValueError, match="a batch of 512 takes"):
         UploadQueue(form, 512, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
+def test_rows_of_answers_arrive_in_order_although_few_fit_at_once(backend, dtype):
+    """Rows of a table are gathered, and a producer may use its own memory again."""
+    table = BrickTable(torch.arange(20 * 27).view(20, 3, 3, 3, 1).to(dtype))
+    form = {"bricks": {"data": ((3, 3, 3, 1), dtype)}, "tiles": {"child": ((8,), torch.int32)}}
+    queue = UploadQueue(form, 5, torch.device(DEVICES[backend]))
+    row = torch.tensor([7, 7, 0, 19, 3, 11, 2, 5, 13, 1, 4])
+    child = torch.arange(24, dtype=torch.int32).view(3, 8)
+    queue.add("bricks", {"node": row + 100, "data": table[row]}, lambda: True)
+    own = {"node": row[:3] + 200, "data": table.bricks[:3].clone()}
+    queue.add("bricks", own, lambda: True)
+    for values in own.values():
+        values.zero_()
+    queue.add("tiles", {"node": row[:3], "child": child}, lambda: True)
+    node, data, tiles = [], [], []
+    while len(node) < 14 or not tiles:
+        if queue.send():
+            bricks, children = queue.device_tables["bricks"], queue.device_tables["tiles"]
+            count = int((bricks["node"] >= 0).sum())
+            node += bricks["node"][:count].tolist()
+            data.append(bricks["data"][:count].cpu().int())
+            tiles += children["child"][children["node"] >= 0].tolist()
+            queue.clear()
+    assert node == [*(row + 100).tolist(), *(row[:3] + 200).tolist()] and queue.sent == 17
+    bricks = table.bricks.int()
+    assert torch.equal(torch.cat(data), torch.cat((bricks[row], bricks[:3])))
+    assert tiles == child.tolist() and not queue.send()
+
+
+@pytest.mark.parametrize("answers", [[False], [True, False]])
+def test_rows_that_are_dropped_while_they_are_copied_are_not_sent(answers):
+    queue = UploadQueue({"bricks": {}}, 2, torch.device("cpu"))
+    wanted = iter(answers)
+    queue.add("bricks", {"node": torch.arange(5)}, lambda: next(wanted))
+    queue.forget()  # before the second answer, as far as the queue can tell
+    assert not queue.send() and next(wanted, None) is None
 
 
 def test_an_engine_that_is_closed_cancels_the_answers_on_their_way(blobs):

@@ -26,7 +26,7 @@ from ..cache.write import (
     put_uniform,
     write_rows,
 )
-from ..pool.staging import TableRows
+from ..pool.staging import TableRows, Voxels
 from ..producers import Bricks, Region, Regions
 from .asker import Answer, Asker, PendingBatch
 from .production import Production
@@ -94,8 +94,8 @@ class HostFrame(RecordedFrame, Asker):
         if not self.active:
             return
         self.active = False
-        # An answer being processed is either queued before the lock is held, and dropped below, or
-        # queued later, and refused because its generation is over.
+        # An answer being processed is either queued before, and dropped below, or refused by its
+        # queue because its generation is over.
         with self._lock:
             self._waiting.clear()
             self.generation += 1
@@ -266,19 +266,16 @@ class HostFrame(RecordedFrame, Asker):
     def _queue_bricks(self, batch: RequestBatch, answer: Bricks) -> None:
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
-        data = {
-            name: voxels.gather() if isinstance(voxels, TableRows) else voxels
-            for name, voxels in answer.data.items()
-        }
+        data = {"data": answer.data}
         if kind is None:
-            self._queue(batch, "bricks", rows, {"data": data})
+            self._queue(batch, "bricks", rows, data)
             return
         is_alias = kind == Region.ALIAS
         if bool(is_alias.any()):
             self._leave_to_host(batch[is_alias])
         brick_word = brick_words(kind)
         is_uniform = brick_word != ABSENT
-        self._queue(batch, "bricks", rows, {"data": data}, ~is_uniform & ~is_alias)
+        self._queue(batch, "bricks", rows, data, ~is_uniform & ~is_alias)
         zeros = {
             name: torch.zeros((len(kind), channel.width), dtype=channel.dtype, device="cpu")
             for name, channel in batch.source.producer.channels.items()
@@ -298,12 +295,12 @@ class HostFrame(RecordedFrame, Asker):
         batch: RequestBatch,
         table: str,
         rows: Mapping[str, Tensor],
-        fields: Mapping[str, Mapping[str, Tensor]],
+        fields: Mapping[str, Voxels],
         index: Tensor | None = None,
     ) -> None:
-        """Queues copies of the entries `index`, or all, of `rows`, and of `fields` by channel. A
-        node may be queued only once; those of an earlier generation are dropped: they may have been
-        requested again.
+        """Queues the entries `index`, or all, of `rows`, and of `fields` by channel. A node may be
+        queued only once; those of an earlier generation are dropped: they may have been requested
+        again.
         """
         flat_fields = {
             f"{name}.{channel}": values
@@ -311,13 +308,13 @@ class HostFrame(RecordedFrame, Asker):
             for channel, values in by_channel.items()
         }
         queue = self._uploads[self._upload_index[batch.source.tree.number]]
-        selected = {
-            name: values.clone() if index is None else movable(values)[index].view(values.dtype)
-            for name, values in {**rows, **flat_fields}.items()
-        }
-        with self._lock:
-            if batch.generation == self.generation:
-                queue.add(table, selected)
+        selected = {**rows, **flat_fields}
+        if index is not None:
+            selected = {
+                n: v[index] if isinstance(v, TableRows) else movable(v)[index].view(v.dtype)
+                for n, v in selected.items()
+            }
+        queue.add(table, selected, lambda: batch.generation == self.generation)
 
 
 def _table_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:
