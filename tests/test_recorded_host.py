@@ -141,7 +141,7 @@ def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
         if how == "failures forgotten":
             engine.forget_failures()
         else:
-            with pytest.raises(KeyError), engine.new_frame(frames.view.options):
+            with pytest.raises(KeyError), engine.new_frame(frames._view.options):
                 raise KeyError
         while len(producer.late) == asked:
             frames.frame()
@@ -165,6 +165,7 @@ def test_a_graph_that_is_dropped_gives_its_buffers_and_its_nodes_back(blobs, bac
             frames.frame()
         producer.late, late = None, producer.late
         del frames
+        gc.collect()
         assert engine.render(view(24), TRANSFER).stats.produced["bricks"] > 0
         assert not engine.host_frames
         for future, bricks in late:
