@@ -87,12 +87,12 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 
     with gv.Engine(Slow(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         Slow.gate.set()
-        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine._host_frames[0]
         while not frames.frame()[1].requests["load"]:
             asker._executor.submit(int).result()
         Slow.gate.clear()
         frames.frame()  # requests these, and is held up
-        engine.release()
+        engine._release()
         for _ in range(2):
             frames.frame()  # requests them again
         Slow.gate.set()
@@ -132,7 +132,7 @@ def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
     """Nodes that are no longer marked as pending are asked for again."""
     producer = Later(blobs)
     with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
-        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]._executor
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine._host_frames[0]._executor
         producer.late = []
         while not producer.late:
             frames.frame()
@@ -167,7 +167,7 @@ def test_a_graph_that_is_dropped_gives_its_buffers_and_its_nodes_back(blobs, bac
         del frames
         gc.collect()
         assert engine.render(view(24), TRANSFER).stats.produced["bricks"] > 0
-        assert not engine.host_frames
+        assert not engine._host_frames
         for future, bricks in late:
             future.set_result(bricks)
         late.clear()
@@ -196,7 +196,7 @@ def test_a_closed_engine_asks_for_nothing_more(blobs, backend):
         while not Slow.asked.is_set():
             frames.frame()
             time.sleep(0.01)
-        asker = engine.host_frames[0]._executor
+        asker = engine._host_frames[0]._executor
     Slow.gate.set()
     asker.shutdown()  # waits for its thread
     assert producer.calls == 1
@@ -283,7 +283,7 @@ def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
         late[0][0].set_result(late[0][1])
         while not any("no answer within" in failure.message for failure in engine.failures):
             frames.frame()
-        engine.release()
+        engine._release()
         assert not waiting and not waiting.unlocked
 
 
@@ -437,5 +437,5 @@ def test_an_engine_that_is_closed_cancels_the_answers_on_their_way(blobs):
         while not late:
             frames.frame()
             time.sleep(0.01)
-        engine.host_frames[0]._executor.submit(int).result()
+        engine._host_frames[0]._executor.submit(int).result()
     assert all(future.cancelled() for future, _ in late)

@@ -306,7 +306,7 @@ class Engine(FrameSteps):
         graph = FrameGraph(self, view, recorded, render_frame, look_ahead)
         if isinstance(recorded, HostFrame):
             recorded.graph = weakref.ref(graph)
-            self.host_frames.append(recorded)
+            self._host_frames.append(recorded)
         return graph
 
     @cached_property
@@ -324,7 +324,7 @@ class Engine(FrameSteps):
         """Lets failed nodes be requested again, and files that servers refused be read again."""
         retry_refused()
         self.production.failures.forget()
-        self.restore_pending()
+        self._restore_pending()
 
     def memory(self) -> dict[str, int]:
         """Returns bytes by name: content of each pool, and bookkeeping."""

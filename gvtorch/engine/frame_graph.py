@@ -129,7 +129,7 @@ class FrameGraph:
             stale = engine.frames != self._frame_number
             if recorded is not None:
                 self._serve_missed(recorded, stale, stats)
-            engine.number_picture()
+            engine._number_picture()
             self._frame_number = engine.frames
             self._draw_from(camera.placed(self._view.box), stale)
             collected = self._collected
@@ -142,7 +142,7 @@ class FrameGraph:
     def _serve_missed(self, recorded: RecordedFrame, stale: bool, stats: FrameStats) -> None:
         """Serves what earlier replays missed; `stale`: other frames came since the last one."""
         engine = self._engine
-        engine.release(keep=recorded)
+        engine._release(keep=recorded)
         engine.readbacks.take_arrived()
         steady = engine.steady and not (self._look_ahead and self._look_ahead.due)
         with stage("serve"):

@@ -78,7 +78,7 @@ class Frames(FrameGraph):
         super().__init__(engine, view, frame, partial(engine.frame, shader=shader), look_ahead)
         self.look_from(camera)
         if isinstance(frame, HostFrame):
-            engine.host_frames.append(frame)
+            engine._host_frames.append(frame)
 
     def _record(self, step: Callable[[], None]) -> Callable[[], None]:
         return step
