@@ -170,7 +170,7 @@ class FrameGraph:
 
 class LookAhead:
     """Rays of future pictures, which request what these would miss. Their camera is where
-    the picture's will be if it moves on as since the last frame; its numbers stay at one address.
+    the picture's will be if its motion since the last frame continues.
 
     There is one of these rays for 4 x 4 pixels of the picture: a brick is wider than that on the
     screen. What they use counts as used and so is kept; their requests are served after the
@@ -192,9 +192,9 @@ class LookAhead:
         self._view = replace(view, camera=thinned, numbers=self._numbers_ahead(), options=options)
 
     def follow(self, camera: Camera, numbers: Tensor, stale: bool) -> None:
-        """Updates `due` and the last frame's numbers, before those of the next picture's placed
-        camera are written to `View.numbers`. `stale`: other frames were rendered since the last
-        one.
+        """Prepares the next frame: updates `due`, and copies the last camera's numbers before the
+        next one's are written to `View.numbers`. `camera` is placed, `numbers` are its own;
+        `stale`: other frames were rendered since the last one.
         """
         self._numbers_before.copy_(numbers if stale else self._numbers)
         moving = not (stale or camera.same(self._camera_before))

@@ -209,7 +209,9 @@ class HostFrame(RecordedFrame, Asker):
             self._executor.submit(self._ask_producers)
 
     def _ask_producers(self) -> None:
-        """Asks for chosen nodes; of a kind with an answer due, `_CALL_GAP` after its last call."""
+        """Asks producers for the chosen nodes. Those of a kind that was asked for less than
+        `_CALL_GAP` ago, with an answer still on its way, are left for later.
+        """
         with self._lock:
             self._ask_scheduled, generation, now = False, self.generation, time.monotonic()
             busy_kinds = {item.batch.kind for item in self._waiting}

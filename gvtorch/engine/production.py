@@ -200,8 +200,8 @@ class Production(Asker):
             self.write(answers, stats)
 
     def _deepen(self, subdivisions: Requests, stats: FrameStats) -> None:
-        """Subdivides the nodes just made as well, where rays will want finer ones, before they ask:
-        by as many levels as the subdivisions want on average.
+        """Subdivides the nodes that were just made, too, where rays will want finer ones, before
+        rays ask for these: by as many levels as the subdivisions want on average.
         """
         branching = max(source.layout.branching for source in self.trees.values())
         for _ in range(extra_levels(levels_wanted(subdivisions.priority, branching).tolist())):
@@ -223,7 +223,7 @@ class Production(Asker):
                 if kind == REQUEST_LOAD and source.producer.needs_parent:
                     batch = self._with_parents(batch)
                 failed = self.failures.among(batch)
-                if failed is not None:  # before its tile was given away: mark it again
+                if failed is not None:  # their marks are gone, as when tiles change hands
                     failed_before, batch = batch[failed], batch[~failed]
                     self._mark(failed_before)
                     self._skipped_count += len(failed_before)

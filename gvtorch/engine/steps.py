@@ -152,8 +152,8 @@ class FrameSteps:
         self._missed = None
 
     def _release(self, keep: RecordedFrame | None = None) -> None:
-        """Drops the answers that are on their way to captured frames, except those of `keep`, and
-        the frames whose graphs are gone, with their buffers.
+        """Drops the answers that are on their way to captured frames, except to `keep`. Captured
+        frames whose graphs are gone are dropped altogether, with their buffers.
         """
         for host_frame in list(self._host_frames):
             if host_frame is not keep:
@@ -163,8 +163,8 @@ class FrameSteps:
                 self._host_frames.remove(host_frame)
 
     def _restore_pending(self) -> None:
-        """Marks the nodes whose answers are on their way as pending, and no others: answers to
-        captured frames are dropped, or their nodes would be asked for, and written, twice.
+        """Marks the nodes whose answers are on their way as pending, and no others. Answers to
+        captured frames are dropped first: their nodes would be requested again, and written twice.
         """
         self._release()
         self.production.restore_pending()
@@ -173,9 +173,9 @@ class FrameSteps:
         """Traces some rays before the picture: while answers are written at once, some rays that
         missed something are traced again, and what they miss next is served within this frame.
 
-        They carry the frame number of the last picture: no slot is given away that it or they used,
-        or that was written since. What exceeds the budgets or the pools is left to the whole
-        picture.
+        Scouts stamp what they use with the frame number of the last picture, as a write does. So a
+        slot is kept if that picture used it, if a scout did, or if it was written since. Requests
+        that exceed the budgets or the pools are left to the picture.
         """
         produced_count, hits = 0, None
         for _ in range(self.options.scout_rounds):
@@ -195,14 +195,14 @@ class FrameSteps:
     def trace(
         self, view: View, progress: Progress = no_progress, again: Again | None = None
     ) -> Hits:
-        """Traces a picture's rays, all or some of them `again`, under a new frame number."""
+        """Traces a picture's rays, or those that `again` selects, under a new frame number."""
         self._number_picture()
         self.cache.frame_1.fill_(self.frames)
         return view.hits(progress, again=again)
 
     def _number_picture(self) -> None:
-        """Gives the next picture its number, with which rays stamp what they use; on the device it
-        is `Cache.frame_1`, which `trace` writes and graphs count up.
+        """Gives the next picture its number, with which rays stamp what they use. Its copy on the
+        device, `Cache.frame_1`, is written by `trace`, or counted up by a graph.
         """
         self.frames += 1
         for source in self.trees.values():
