@@ -126,6 +126,40 @@ def test_an_answer_that_its_producer_cancels_has_failed(blobs, backend):
         assert all(min(failure.loc[:3]) > 2 for failure in engine.failures)
 
 
+class Sudden(Future):
+    """Gets its answer just after somebody looked whether it is there."""
+
+    def __init__(self, answer: Any) -> None:
+        super().__init__()
+        self.answer = answer
+
+    def done(self) -> bool:
+        was_done = super().done()
+        if not was_done:
+            self.set_result(self.answer)
+        return was_done
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_an_answer_that_arrives_before_it_is_waited_for_is_written_once(blobs, backend):
+    """Its callback is called at once, in the thread that asked."""
+
+    class Quick(gv.VolumeProducer):
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            return bricks if (nodes.depth == 0).any() else Sudden(bricks)
+
+    with gv.Engine(Quick(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        expected = engine.render(view(24), TRANSFER)
+        assert expected.stats.produced["bricks"] > 8
+    with gv.Engine(Quick(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        hits, _ = frames.whole(pause=0.01)
+        engine.validate()
+        assert frames.served.pending == 0 and not frames.served._waiting
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+
+
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("how", ["failures forgotten", "frame broken off"])
 def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
