@@ -1,5 +1,5 @@
-"""`Asker`: asks producers for request batches, and knows those whose answers are on their way. The
-classes made of it say where answers go: `Production`, `HostFrame`.
+"""`Asker`: asks producers for request batches, and knows those whose answers are on their way. Its
+subclasses say where answers go: `Production` into the pools, `HostFrame` to a recorded frame.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class PendingBatch:
 
 
 class Asker(ABC):
-    """The way of a request batch from the call of its producer to the checked answer. If the
-    producer raises, it is asked again for each half. Any thread may use it.
+    """Takes request batches from the call of their producer to the checked answer. If a producer
+    raises, it is called again for each half of the batch. Any thread may use it.
 
     Attributes:
-        generation: Batches of another generation are dropped.
+        generation: Batches whose own differs are dropped.
     """
 
     generation: int | None = None
@@ -55,11 +55,11 @@ class Asker(ABC):
 
     @abstractmethod
     def _on_future(self, batch: RequestBatch, future: Future) -> None:
-        """Passes a batch whose answer is on its way to `_wait_for`."""
+        """Takes a batch whose answer is on its way, and calls `_wait_for`."""
 
     @abstractmethod
     def _on_answer(self, batch: RequestBatch, answer: Answer) -> None:
-        """Takes an answer, in the thread in which it was settled."""
+        """Takes an answer, in the thread that settles its batch."""
 
     @abstractmethod
     def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
@@ -68,7 +68,7 @@ class Asker(ABC):
         """
 
     def _submit(self, batch: RequestBatch) -> bool:
-        """Asks for a batch, and settles it if its answer is here at once; returns whether it is."""
+        """Asks for a batch, and settles it if its answer comes at once; returns whether it does."""
         if batch.generation != self.generation:
             return False
         answer, raised = _try_call(batch.ask)
@@ -89,8 +89,8 @@ class Asker(ABC):
         return item
 
     def _take(self, test: Callable[[PendingBatch], bool]) -> list[PendingBatch]:
-        """Returns those that wait and pass a test, oldest first; they wait no more, so that no
-        other thread takes them.
+        """Removes the batches that pass a test from those that wait, so that each is taken by one
+        thread only; returns them, the oldest first.
         """
         with self._lock:
             taken = [item for item in self._waiting if test(item)]
