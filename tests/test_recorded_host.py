@@ -7,6 +7,7 @@ import math
 import threading
 import time
 import weakref
+from collections.abc import Iterator
 from concurrent.futures import Future
 from typing import Any
 
@@ -16,9 +17,10 @@ from helpers import DEVICES
 from helpers.recorded import COMPILED, TRANSFER, Frames, view
 
 import gvtorch as gv
-from gvtorch.engine import host_frame, request_batch
+from gvtorch.engine import asker, host_frame
 from gvtorch.engine.upload_queue import UploadQueue
 from gvtorch.io.stores.conversion import convert
+from gvtorch.pool.staging import BrickTable
 
 
 def on_the_host(blobs, tmp_path, kind: str) -> gv.Producer:
@@ -85,12 +87,12 @@ def test_what_was_asked_before_a_frame_of_the_host_is_dropped_however_late(blobs
 
     with gv.Engine(Slow(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         Slow.gate.set()
-        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine._host_frames[0]
         while not frames.frame()[1].requests["load"]:
             asker._executor.submit(int).result()
         Slow.gate.clear()
         frames.frame()  # requests these, and is held up
-        engine.release()
+        engine._release()
         for _ in range(2):
             frames.frame()  # requests them again
         Slow.gate.set()
@@ -124,13 +126,47 @@ def test_an_answer_that_its_producer_cancels_has_failed(blobs, backend):
         assert all(min(failure.loc[:3]) > 2 for failure in engine.failures)
 
 
+class Sudden(Future):
+    """Gets its answer just after somebody looked whether it is there."""
+
+    def __init__(self, answer: Any) -> None:
+        super().__init__()
+        self.answer = answer
+
+    def done(self) -> bool:
+        was_done = super().done()
+        if not was_done:
+            self.set_result(self.answer)
+        return was_done
+
+
+@pytest.mark.parametrize("backend", COMPILED)
+def test_an_answer_that_arrives_before_it_is_waited_for_is_written_once(blobs, backend):
+    """Its callback is called at once, in the thread that asked."""
+
+    class Quick(gv.VolumeProducer):
+        def fill(self, nodes):
+            bricks = super().fill(nodes)
+            return bricks if (nodes.depth == 0).any() else Sudden(bricks)
+
+    with gv.Engine(Quick(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        expected = engine.render(view(24), TRANSFER)
+        assert expected.stats.produced["bricks"] > 8
+    with gv.Engine(Quick(blobs), brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 64)
+        hits, _ = frames.whole(pause=0.01)
+        engine.validate()
+        assert frames.served.pending == 0 and not frames.served._waiting
+    assert torch.equal(hits.color, expected.color.reshape(-1, 3))
+
+
 @pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("how", ["failures forgotten", "frame broken off"])
 def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
     """Nodes that are no longer marked as pending are asked for again."""
     producer = Later(blobs)
     with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
-        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine.host_frames[0]._executor
+        frames, asker = Frames(engine, view(24), TRANSFER, 64), engine._host_frames[0]._executor
         producer.late = []
         while not producer.late:
             frames.frame()
@@ -139,7 +175,7 @@ def test_answers_on_their_way_are_not_written_twice(blobs, backend, how):
         if how == "failures forgotten":
             engine.forget_failures()
         else:
-            with pytest.raises(KeyError), engine.new_frame(frames.view.options):
+            with pytest.raises(KeyError), engine.new_frame(frames._view.options):
                 raise KeyError
         while len(producer.late) == asked:
             frames.frame()
@@ -163,8 +199,9 @@ def test_a_graph_that_is_dropped_gives_its_buffers_and_its_nodes_back(blobs, bac
             frames.frame()
         producer.late, late = None, producer.late
         del frames
+        gc.collect()
         assert engine.render(view(24), TRANSFER).stats.produced["bricks"] > 0
-        assert not engine.host_frames
+        assert not engine._host_frames
         for future, bricks in late:
             future.set_result(bricks)
         late.clear()
@@ -193,7 +230,7 @@ def test_a_closed_engine_asks_for_nothing_more(blobs, backend):
         while not Slow.asked.is_set():
             frames.frame()
             time.sleep(0.01)
-        asker = engine.host_frames[0]._executor
+        asker = engine._host_frames[0]._executor
     Slow.gate.set()
     asker.shutdown()  # waits for its thread
     assert producer.calls == 1
@@ -245,7 +282,7 @@ def test_a_batch_whose_frames_were_dropped_while_it_was_asked_for_is_not_waited_
         assert not frames.served._waiting, "its kind would count as busy"
 
 
-class Guarded(dict[Any, Any]):
+class Guarded(list[Any]):
     """Lists its methods that are called while nobody holds a lock."""
 
     def __init__(self, lock: threading.Lock) -> None:
@@ -253,19 +290,14 @@ class Guarded(dict[Any, Any]):
         self.lock, self.unlocked = lock, []
 
     def __getattribute__(self, name: str) -> Any:
-        if name in ("pop", "clear", "values", "items") and not self.lock.locked():
+        if name in ("append", "remove", "clear") and not self.lock.locked():
             self.unlocked.append(name)
         return super().__getattribute__(name)
 
-    def __setitem__(self, key: Any, value: Any) -> None:
+    def __iter__(self) -> Iterator[Any]:
         if not self.lock.locked():
-            self.unlocked.append("set")
-        super().__setitem__(key, value)
-
-    def __delitem__(self, key: Any) -> None:
-        if not self.lock.locked():
-            self.unlocked.append("delete")
-        super().__delitem__(key)
+            self.unlocked.append("iter")
+        return super().__iter__()
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -285,7 +317,7 @@ def test_answers_on_their_way_are_listed_under_a_lock(blobs, backend):
         late[0][0].set_result(late[0][1])
         while not any("no answer within" in failure.message for failure in engine.failures):
             frames.frame()
-        engine.release()
+        engine._release()
         assert not waiting and not waiting.unlocked
 
 
@@ -331,6 +363,31 @@ def test_what_raises_costs_itself_alone_and_what_never_comes_is_given_up(blobs, 
 
 
 @pytest.mark.parametrize("backend", COMPILED)
+def test_several_batches_may_wait_for_one_future(blobs, backend, monkeypatch):
+    never: Future = Future()
+
+    class Shared(gv.VolumeProducer):
+        patience, calls = 0.3, 0
+
+        def fill(self, nodes):
+            if (nodes.depth == 0).any():
+                return super().fill(nodes)
+            self.calls += 1
+            return never
+
+    monkeypatch.setattr(host_frame, "_CALL_GAP", 0.0)
+    producer = Shared(blobs)
+    with gv.Engine(producer, brick_size=4, device=DEVICES[backend]) as engine:
+        frames = Frames(engine, view(24), TRANSFER, 3)
+        while not never.done():
+            frames.frame()
+            frames.served._executor.submit(int).result()  # until its requests are passed on
+        assert producer.calls > 1
+        frames.whole(pause=0.01)
+        assert frames.served.pending == 0
+
+
+@pytest.mark.parametrize("backend", COMPILED)
 @pytest.mark.parametrize("later", [False, True])
 def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
     blobs, later, backend, monkeypatch
@@ -346,7 +403,7 @@ def test_a_producer_on_the_host_that_always_raises_is_not_asked_for_ever(
             answer.set_exception(RuntimeError("out of order"))
             return answer if later else answer.result()
 
-    monkeypatch.setattr(request_batch, "_MAX_RAISING_CALLS", 8)
+    monkeypatch.setattr(asker, "_MAX_RAISING_CALLS", 8)
     with gv.Engine(Never(blobs), brick_size=4, device=DEVICES[backend]) as engine:
         frames = Frames(engine, view(48), TRANSFER, 64)
         while not calls:
@@ -367,6 +424,45 @@ def test_a_batch_larger_than_memory_is_refused_before_it_is_allocated(monkeypatc
         UploadQueue(form, 512, torch.device("cpu"))
 
 
+@pytest.mark.parametrize("backend", COMPILED)
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
+def test_rows_of_answers_arrive_in_order_although_few_fit_at_once(backend, dtype):
+    """Rows of a table are gathered, and a producer may use its own memory again."""
+    table = BrickTable(torch.arange(20 * 27).view(20, 3, 3, 3, 1).to(dtype))
+    form = {"bricks": {"data": ((3, 3, 3, 1), dtype)}, "tiles": {"child": ((8,), torch.int32)}}
+    queue = UploadQueue(form, 5, torch.device(DEVICES[backend]))
+    row = torch.tensor([7, 7, 0, 19, 3, 11, 2, 5, 13, 1, 4])
+    child = torch.arange(24, dtype=torch.int32).view(3, 8)
+    queue.add("bricks", {"node": row + 100, "data": table[row]}, lambda: True)
+    own = {"node": row[:3] + 200, "data": table.bricks[:3].clone()}
+    queue.add("bricks", own, lambda: True)
+    for values in own.values():
+        values.zero_()
+    queue.add("tiles", {"node": row[:3], "child": child}, lambda: True)
+    node, data, tiles = [], [], []
+    while len(node) < 14 or not tiles:
+        if queue.send():
+            bricks, children = queue.device_tables["bricks"], queue.device_tables["tiles"]
+            count = int((bricks["node"] >= 0).sum())
+            node += bricks["node"][:count].tolist()
+            data.append(bricks["data"][:count].cpu().int())
+            tiles += children["child"][children["node"] >= 0].tolist()
+            queue.clear()
+    assert node == [*(row + 100).tolist(), *(row[:3] + 200).tolist()] and queue.sent == 17
+    bricks = table.bricks.int()
+    assert torch.equal(torch.cat(data), torch.cat((bricks[row], bricks[:3])))
+    assert tiles == child.tolist() and not queue.send()
+
+
+@pytest.mark.parametrize("answers", [[False], [True, False]])
+def test_rows_that_are_dropped_while_they_are_copied_are_not_sent(answers):
+    queue = UploadQueue({"bricks": {}}, 2, torch.device("cpu"))
+    wanted = iter(answers)
+    queue.add("bricks", {"node": torch.arange(5)}, lambda: next(wanted))
+    queue.forget()  # before the second answer, as far as the queue can tell
+    assert not queue.send() and next(wanted, None) is None
+
+
 def test_an_engine_that_is_closed_cancels_the_answers_on_their_way(blobs):
     producer = Later(blobs)
     with gv.Engine(producer, brick_size=4) as engine:
@@ -375,5 +471,5 @@ def test_an_engine_that_is_closed_cancels_the_answers_on_their_way(blobs):
         while not late:
             frames.frame()
             time.sleep(0.01)
-        engine.host_frames[0]._executor.submit(int).result()
+        engine._host_frames[0]._executor.submit(int).result()
     assert all(future.cancelled() for future, _ in late)

@@ -38,7 +38,7 @@ class AliasRows(NamedTuple):
     tree_loc: Tensor  # (a, 5) int64 number of its tree, and its loc
     goal: Tensor  # (a, 5) the same of the target
     target: Tensor  # (a,) int64 the target, or the node whose children are asked for
-    target_tree_loc: Tensor  # (a, 5) the same of `target`; not `goal` below another alias
+    target_tree_loc: Tensor  # (a, 5) the same of `target`; not `goal` if another alias leads there
     exact: Tensor  # (a,) bool, whether `target` lies at `goal`
 
     def select(self, index: Tensor) -> AliasRows:

@@ -22,8 +22,8 @@ class LRU:
             graphs read it; on the CPU it is a window of a slightly larger tensor, which moves on as
             slots are given.
         unused: How many slots at the front the last picture did not use; these may be taken.
-        fresh: How many of these, the first ones, never held anything, so that a frame need not look
-            at them; 0 on CUDA, where the host does not know.
+        fresh: How many slots at the front have never held anything. A frame need not look at their
+            stamps. 0 on CUDA, where the host does not know how many there are.
     """
 
     def __init__(self, capacity: int, locked: int, device: torch.device) -> None:
@@ -192,8 +192,8 @@ class Cache:
         """Raises ValueError unless orders, owners and pointers agree about every slot.
 
         Pointers that lead nowhere are found by `N3Tree.validate`. Words of a tile that is linked to
-        no tree are ignored: one that changes hands when memory runs out keeps its old ones until it
-        is given away again.
+        no tree are ignored: if memory runs out while a tile changes hands, it keeps its old words
+        until it is given away again.
         """
         nodes, bricks = self.nodes, self.bricks
         sizes = (nodes.capacity, bricks.capacity)

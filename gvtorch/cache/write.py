@@ -125,8 +125,8 @@ def put_tiles(cache: Cache, targets: Targets, children: Children, free: Tensor) 
     (lru,), pool, per_tile = cache.lru[REQUEST_SUBDIVIDE], cache.nodes, cache.nodes.nodes_per_tile
     tree, node = targets.tree, targets.node
     wanted = targets.lacking(cache, REQUEST_SUBDIVIDE)
-    # A late answer may be for nodes that are no longer used: those whose own tile is among the ones
-    # given away get no children now.
+    # Nodes of a late answer may be out of use: those whose own tile is about to be given away get
+    # no children.
     front = lru.order[: len(node)].to(torch.int64)
     limit = torch.minimum(wanted.sum(), free)
     leaving = torch.zeros(pool.capacity, dtype=torch.bool, device=node.device)

@@ -261,9 +261,9 @@ class Engine(FrameSteps):
         Args:
             camera: Cameras of the number, size and model that replays will have.
             shader: For all trees, or one for each; no `ModuleShader`.
-            batch: Most bricks that a replay makes, and most node tiles of each level: per tree if
-                producers are `on_host`, in all if `on_device`; then a tree may deepen by several
-                levels.
+            batch: Most bricks that a replay makes, and most node tiles of each level. This limits
+                each tree if producers are `on_host`, and all trees together if they are
+                `on_device`; only these may deepen a tree by several levels in a replay.
             look_ahead: While the camera moves, a replay also requests what the picture this many
                 frames later will miss if the motion continues, with a sixteenth of the picture's
                 rays. The picture's own requests are served first. 0: no look-ahead.
@@ -306,7 +306,7 @@ class Engine(FrameSteps):
         graph = FrameGraph(self, view, recorded, render_frame, look_ahead)
         if isinstance(recorded, HostFrame):
             recorded.graph = weakref.ref(graph)
-            self.host_frames.append(recorded)
+            self._host_frames.append(recorded)
         return graph
 
     @cached_property
@@ -324,7 +324,7 @@ class Engine(FrameSteps):
         """Lets failed nodes be requested again, and files that servers refused be read again."""
         retry_refused()
         self.production.failures.forget()
-        self.restore_pending()
+        self._restore_pending()
 
     def memory(self) -> dict[str, int]:
         """Returns bytes by name: content of each pool, and bookkeeping."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -19,7 +18,7 @@ from ..pictures import Picture
 from ..tracing.pixels import View
 from .device_frame import DeviceFrame
 from .recorded import RecordedFrame
-from .stats import Collected, FrameStats
+from .stats import FrameStats
 from .steps import FrameSteps
 
 _STRIDE = 4  # pixels between look-ahead rays
@@ -56,34 +55,51 @@ class FrameGraph:
         self._view = view = replace(view, numbers=view.numbers.clone())  # written by replays
         self._frame_number = -1  # of the last replay's picture
         self._look_ahead = LookAhead(view, look_ahead) if look_ahead else None
-        graphs = [torch.cuda.CUDAGraph() for _ in range(5)]
-        self._serve, self._deepen, self._draw, self._look, self._finish = graphs
         if recorded is not None:
-            with _record_graph(self._serve, engine.device):
-                recorded.serve()
+            self._serve = self._record(recorded.serve)
         if isinstance(recorded, DeviceFrame):
-            with _record_graph(self._deepen, engine.device):
-                recorded.deepen()
-        with _record_graph(self._draw, engine.device):
-            if recorded is None:
-                engine.cache.frame_1.add_(1)
-                self._hits = view.hits()
-            else:
-                self._hits = recorded.draw(view, self._look_ahead is not None)
-            self._picture = view.picture(self._hits, FrameStats())
-            if self._look_ahead is None:
-                self._collected = self._collect()
+            self._deepen = self._record(recorded.deepen)
+        self._draw = self._record(self._draw_picture)
         if recorded is not None and self._look_ahead is not None:
-            with _record_graph(self._look, engine.device):
-                recorded.look_ahead(self._look_ahead.hits)
-            with _record_graph(self._finish, engine.device):
-                self._collected = self._collect()
+            self._look = self._record(functools.partial(recorded.look_ahead, self._look_ahead.hits))
+            self._finish = self._record(self._collect)
 
-    def _collect(self) -> Collected:
+    def _record(self, step: Callable[[], None]) -> Callable[[], None]:
+        """Records a step's work on the device as a graph; returns the function that launches it.
+        Meanwhile Python collects no garbage: freeing what an old engine held, such as locked host
+        memory, would abort the recording.
+        """
+        graph, device = torch.cuda.CUDAGraph(), self._engine.device
+        gc_was_enabled = gc.isenabled()
+        gc.disable()
+        try:
+            stream = _recording_stream(device)
+            recording = torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local")
+            with torch.cuda.device(device), recording:
+                step()
+        finally:
+            if gc_was_enabled:
+                gc.enable()
+        return graph.replay
+
+    def _draw_picture(self) -> None:
+        """Traces the picture; collects its requests, unless look-ahead rays come first."""
+        view, recorded = self._view, self._recorded
+        if recorded is None:
+            self._engine.cache.frame_1.add_(1)
+            self._hits = view.hits()
+        else:
+            self._hits = recorded.draw(view, self._look_ahead is not None)
+        self._picture = view.picture(self._hits, FrameStats())
+        if self._look_ahead is None:
+            self._collect()
+
+    def _collect(self) -> None:
         """Lists the picture's requests, sorts the slots by use, and counts."""
         if self._recorded is None:
-            return self._engine.collect_requests_and_use(self._hits.samples)
-        return self._recorded.finish(self._hits)
+            self._collected = self._engine.collect_requests_and_use(self._hits.samples)
+        else:
+            self._collected = self._recorded.finish(self._hits)
 
     def replay(self, camera: Camera | Rays) -> tuple[Picture, FrameStats]:
         """Renders a frame; the host does not wait for the device.
@@ -101,21 +117,25 @@ class FrameGraph:
         captured = self._view.camera.form
         if camera.form != captured:
             raise ValueError(f"replay: camera must be {captured} as captured, got {camera.form}")
-        with self._engine.lock:
-            return self._replay(camera)
+        engine, recorded = self._engine, self._recorded
+        with engine.lock:
+            if engine.changed or (recorded and recorded.take_host_needed(engine.readbacks)):
+                return self._render_frame(camera)  # which also renews the changed trees
+            with torch.cuda.device(engine.device):
+                return self._replay(camera)
 
     def _replay(self, camera: Camera) -> tuple[Picture, FrameStats]:
-        engine, recorded, collected = self._engine, self._recorded, self._collected
-        if engine.changed or (recorded and recorded.take_host_needed(engine.readbacks)):
-            return self._render_frame(camera)  # which also renews the changed trees
-        with torch.cuda.device(engine.device), engine.new_frame(self._view.options) as stats:
+        engine, recorded = self._engine, self._recorded
+        with engine.new_frame(self._view.options) as stats:
             stale = engine.frames != self._frame_number
             if recorded is not None:
                 self._serve_missed(recorded, stale, stats)
-                collected = recorded.to_read_back(collected)
-            engine.number_picture()
+            engine._number_picture()
             self._frame_number = engine.frames
             self._draw_from(camera.placed(self._view.box), stale)
+            collected = self._collected
+            if recorded is not None:
+                collected = recorded.to_read_back(collected)
             engine.read_back(stats, self._hits, collected)
         engine.readbacks.hold_back()
         return replace(self._picture, stats=stats), stats
@@ -123,14 +143,14 @@ class FrameGraph:
     def _serve_missed(self, recorded: RecordedFrame, stale: bool, stats: FrameStats) -> None:
         """Serves what earlier replays missed; `stale`: other frames came since the last one."""
         engine = self._engine
-        engine.release(keep=recorded)
+        engine._release(keep=recorded)
         engine.readbacks.take_arrived()
         steady = engine.steady and not (self._look_ahead and self._look_ahead.due)
         with stage("serve"):
             if recorded.begin(stale, steady, stats):
-                self._serve.replay()
+                self._serve()
                 for _ in range(engine.readbacks.extra_levels):
-                    self._deepen.replay()
+                    self._deepen()
 
     def _draw_from(self, camera: Camera, stale: bool) -> None:
         """Draws what a placed camera sees; `stale`: other frames came since the last replay."""
@@ -139,11 +159,11 @@ class FrameGraph:
             look_ahead.follow(camera, numbers, stale)
         self._view.numbers.copy_(numbers)
         with stage("replay"):
-            self._draw.replay()
+            self._draw()
             if look_ahead is not None:
                 if look_ahead.due:
-                    self._look.replay()
-                self._finish.replay()
+                    self._look()
+                self._finish()
 
     def __repr__(self) -> str:
         return f"FrameGraph({self._view.camera!r})"
@@ -151,7 +171,7 @@ class FrameGraph:
 
 class LookAhead:
     """Rays of future pictures, which request what these would miss. Their camera is where
-    the picture's will be if it moves on as since the last frame; its numbers stay at one address.
+    the picture's will be if its motion since the last frame continues.
 
     There is one of these rays for 4 x 4 pixels of the picture: a brick is wider than that on the
     screen. What they use counts as used and so is kept; their requests are served after the
@@ -173,9 +193,9 @@ class LookAhead:
         self._view = replace(view, camera=thinned, numbers=self._numbers_ahead(), options=options)
 
     def follow(self, camera: Camera, numbers: Tensor, stale: bool) -> None:
-        """Updates `due` and the last frame's numbers, before those of the next picture's placed
-        camera are written to `View.numbers`. `stale`: other frames were rendered since the last
-        one.
+        """Prepares the next frame: updates `due`, and copies the last camera's numbers before the
+        next one's are written to `View.numbers`. `camera` is placed, `numbers` are its own;
+        `stale`: other frames were rendered since the last one.
         """
         self._numbers_before.copy_(numbers if stale else self._numbers)
         moving = not (stale or camera.same(self._camera_before))
@@ -198,20 +218,3 @@ def _recording_stream(device: torch.device) -> torch.cuda.Stream:
     on the first that recorded: graphs of the others would be empty.
     """
     return torch.cuda.Stream(device)
-
-
-@contextmanager
-def _record_graph(graph: torch.cuda.CUDAGraph, device: torch.device) -> Iterator[None]:
-    """Records the block's device work as a graph. Meanwhile Python collects no garbage: freeing
-    what an old engine held, such as locked host memory, would abort the recording.
-    """
-    gc_was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        stream = _recording_stream(device)
-        recording = torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local")
-        with torch.cuda.device(device), recording:
-            yield
-    finally:
-        if gc_was_enabled:
-            gc.enable()

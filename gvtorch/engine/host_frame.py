@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -27,26 +26,19 @@ from ..cache.write import (
     put_uniform,
     write_rows,
 )
-from ..pool.staging import TableRows
+from ..pool.staging import TableRows, Voxels
 from ..producers import Bricks, Region, Regions
-from .production import Production, try_call
+from .asker import Answer, Asker, PendingBatch
+from .production import Production
 from .recorded import RecordedFrame, SlotCounts
-from .request_batch import (
-    ProducedTree,
-    RequestBatch,
-    brick_words,
-    children_of,
-    give_up,
-    halves_to_retry,
-    valid_part,
-)
+from .request_batch import ProducedTree, RequestBatch, brick_words, children_of
 from .stats import Collected, FrameStats
 from .upload_queue import RowForm, UploadQueue
 
 _CALL_GAP = 0.02  # seconds after which a late answer no longer delays the next call
 
 
-class HostFrame(RecordedFrame):
+class HostFrame(RecordedFrame, Asker):
     """Frames of an engine whose producers all answer from the host (`Producer.on_host`).
 
     The nodes that a frame chose reach the host with its counts (`ask`). A thread asks producers for
@@ -62,17 +54,17 @@ class HostFrame(RecordedFrame):
     graph: Callable[[], object] | None = None
 
     def __init__(self, production: Production, batch: int, fit: bool) -> None:
-        super().__init__(production, batch, fit)
+        RecordedFrame.__init__(self, production, batch, fit)
+        Asker.__init__(self)
         device = self._unused_slots.device
         forms = [_table_forms(self.cache, source) for source in self.trees]
         self._uploads = [UploadQueue(form, batch, device) for form in forms]
         self._upload_index = {source.tree.number: index for index, source in enumerate(self.trees)}
-        self.generation = 0  # counts releases: answers to requests of an earlier one are dropped
+        self.generation: int = 0  # counts releases
         # Nodes asked for, and failed, since the last `release`.
         self._asked_count = self._failed_count = 0
         self.active = False  # whether frames have been rendered since the last `release`
-        self._lock = threading.Lock()  # held to read or write the four fields below
-        self._waiting: dict[Future, tuple[float, RequestBatch]] = {}  # deadlines
+        # Held with the lock of `Asker`, like its list:
         self._chosen: dict[int, list[Tensor]] = {kind: [] for kind in KINDS.values()}
         self._last_call = dict.fromkeys(KINDS.values(), -math.inf)  # seconds
         self._ask_scheduled = False  # whether `_ask_producers` is scheduled
@@ -91,7 +83,7 @@ class HostFrame(RecordedFrame):
         self.active = True
         if stale:
             self._unused_slots.zero_()  # the counts are out of date
-        self._fail_overdue()
+        self._give_up_overdue()
         self._schedule_ask()
         sent = [queue.send() for queue in self._uploads]
         stats.pending, stats.failed = self.pending, len(self._production.failures)
@@ -102,8 +94,8 @@ class HostFrame(RecordedFrame):
         if not self.active:
             return
         self.active = False
-        # An answer being processed is either queued before the lock is held, and dropped below, or
-        # queued later, and refused because its generation is over.
+        # An answer being processed is either queued before, and dropped below, or refused by its
+        # queue because its generation is over.
         with self._lock:
             self._waiting.clear()
             self.generation += 1
@@ -124,10 +116,7 @@ class HostFrame(RecordedFrame):
         """Cancels the answers on their way, and ends the thread that asks for more."""
         with self._lock:
             self.generation += 1
-            futures = list(self._waiting)
-            self._waiting.clear()
-        for future in futures:
-            future.cancel()
+        self._cancel()
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def serve(self) -> None:
@@ -220,10 +209,12 @@ class HostFrame(RecordedFrame):
             self._executor.submit(self._ask_producers)
 
     def _ask_producers(self) -> None:
-        """Asks for chosen nodes; of a kind with an answer due, `_CALL_GAP` after its last call."""
+        """Asks producers for the chosen nodes. Those of a kind that was asked for less than
+        `_CALL_GAP` ago, with an answer still on its way, are left for later.
+        """
         with self._lock:
             self._ask_scheduled, generation, now = False, self.generation, time.monotonic()
-            busy_kinds = {batch.kind for _, batch in self._waiting.values()}
+            busy_kinds = {item.batch.kind for item in self._waiting}
             free_kinds = [
                 kind
                 for kind in self._chosen
@@ -241,56 +232,24 @@ class HostFrame(RecordedFrame):
                     targets = Targets(source.tree, node, loc)
                     self._submit(RequestBatch(source, kind, targets, generation=generation))
 
-    def _submit(self, batch: RequestBatch) -> None:
-        """Asks for a batch. One of an earlier generation is dropped."""
-        if batch.generation != self.generation:
-            return
-        answer, raised = try_call(batch.ask)
-        if not isinstance(answer, Future):
-            self._settle(batch, answer, raised)
-            return
+    def _on_future(self, batch: RequestBatch, future: Future) -> None:
+        item = self._wait_for(batch, future, future)
+        future.add_done_callback(lambda _future: self._on_arrival(item))  # at once if it is done
 
-        def on_arrival(future: Future) -> None:
-            with self._lock:
-                was_waiting = self._waiting.pop(future, None) is not None  # else it was given up
-            self._schedule_ask()
-            if was_waiting and batch.generation == self.generation:
-                self._settle(batch, *try_call(future.result))
+    def _on_arrival(self, item: PendingBatch) -> None:
+        """Settles a batch, in the thread in which its answer arrives."""
+        was_waiting = bool(self._take(lambda other: other is item))  # else it was given up
+        self._schedule_ask()
+        if was_waiting:
+            self._settle_late(item)
 
-        with self._lock:  # not while a callback is added: it may be called at once
-            if batch.generation == self.generation:
-                self._waiting[answer] = time.monotonic() + batch.source.patience, batch
-        answer.add_done_callback(on_arrival)
-
-    def _fail_overdue(self) -> None:
-        """Records batches as failed whose answers have not come in time."""
-        now = time.monotonic()
-        with self._lock:
-            overdue = {f: batch for f, (deadline, batch) in self._waiting.items() if deadline < now}
-            for future in overdue:
-                del self._waiting[future]
-        for future, batch in overdue.items():
-            give_up(batch, future, self._fail)
-
-    def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> None:
-        """Checks an answer and queues it, in the thread in which it arrives; if the producer
-        raised, asks it again for each half of the batch.
-        """
-        if raised is not None:
-            for half in halves_to_retry(batch, raised, self._fail):
-                self._submit(half)
-            return
-        valid = valid_part(batch, answer, self._fail)
-        if valid is None:
-            return
-        valid_batch, checked = valid
-        if isinstance(checked, Regions):
-            self._queue_tiles(valid_batch, checked)
-        else:
-            self._queue_bricks(valid_batch, checked)
+    def _on_answer(self, batch: RequestBatch, answer: Answer) -> None:
+        if isinstance(answer, Regions):
+            self._queue_tiles(batch, answer)
+        elif isinstance(answer, Bricks):
+            self._queue_bricks(batch, answer)
 
     def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
-        """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         with self._lock:
             if batch.generation == self.generation:
                 self._failed_count += len(batch)
@@ -309,19 +268,16 @@ class HostFrame(RecordedFrame):
     def _queue_bricks(self, batch: RequestBatch, answer: Bricks) -> None:
         targets, kind = batch.targets, answer.kind
         rows = {"node": targets.node, "loc": targets.loc}
-        data = {
-            name: voxels.gather() if isinstance(voxels, TableRows) else voxels
-            for name, voxels in answer.data.items()
-        }
+        data = {"data": answer.data}
         if kind is None:
-            self._queue(batch, "bricks", rows, {"data": data})
+            self._queue(batch, "bricks", rows, data)
             return
         is_alias = kind == Region.ALIAS
         if bool(is_alias.any()):
             self._leave_to_host(batch[is_alias])
         brick_word = brick_words(kind)
         is_uniform = brick_word != ABSENT
-        self._queue(batch, "bricks", rows, {"data": data}, ~is_uniform & ~is_alias)
+        self._queue(batch, "bricks", rows, data, ~is_uniform & ~is_alias)
         zeros = {
             name: torch.zeros((len(kind), channel.width), dtype=channel.dtype, device="cpu")
             for name, channel in batch.source.producer.channels.items()
@@ -341,12 +297,12 @@ class HostFrame(RecordedFrame):
         batch: RequestBatch,
         table: str,
         rows: Mapping[str, Tensor],
-        fields: Mapping[str, Mapping[str, Tensor]],
+        fields: Mapping[str, Voxels],
         index: Tensor | None = None,
     ) -> None:
-        """Queues copies of the entries `index`, or all, of `rows`, and of `fields` by channel. A
-        node may be queued only once; those of an earlier generation are dropped: they may have been
-        requested again.
+        """Queues the entries `index`, or all, of `rows`, and of `fields` by channel. A node may be
+        queued only once; those of an earlier generation are dropped: they may have been requested
+        again.
         """
         flat_fields = {
             f"{name}.{channel}": values
@@ -354,13 +310,13 @@ class HostFrame(RecordedFrame):
             for channel, values in by_channel.items()
         }
         queue = self._uploads[self._upload_index[batch.source.tree.number]]
-        selected = {
-            name: values.clone() if index is None else movable(values)[index].view(values.dtype)
-            for name, values in {**rows, **flat_fields}.items()
-        }
-        with self._lock:
-            if batch.generation == self.generation:
-                queue.add(table, selected)
+        selected = {**rows, **flat_fields}
+        if index is not None:
+            selected = {
+                n: v[index] if isinstance(v, TableRows) else movable(v)[index].view(v.dtype)
+                for n, v in selected.items()
+            }
+        queue.add(table, selected, lambda: batch.generation == self.generation)
 
 
 def _table_forms(cache: Cache, source: ProducedTree) -> dict[str, RowForm]:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future
 from concurrent.futures import wait as wait_for
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,18 +27,15 @@ from ..cache.write import Targets, Written
 from ..pool.staging import SentBricks, Staging, upload
 from ..producers import Bricks, Region, Regions
 from . import parents
+from .asker import Answer, Asker
 from .request_batch import (
-    Answered,
     ProducedTree,
     RequestBatch,
     brick_words,
     by_kind,
     check_and_send,
     children_of,
-    give_up,
-    halves_to_retry,
     send_voxels,
-    valid_part,
 )
 from .stats import Counts, FrameStats
 
@@ -122,30 +119,14 @@ class Failures:
             self._failed = {node for node in self._failed if tree not in (None, node[0])}
 
 
-@dataclass(frozen=True, eq=False)
-class _PendingBatch:
-    """A batch whose answer is on its way."""
+class Answered(NamedTuple):
+    """A batch and its answer."""
 
     batch: RequestBatch
-    producer_future: Future  # what the producer returned
-    answer_future: Future  # of the same answer, after bricks on the host were checked and sent
-    asked_at: float  # time.monotonic()
-
-    @property
-    def seconds_left(self) -> float:
-        """Seconds until it is given up."""
-        return self.asked_at + self.batch.source.patience - time.monotonic()
+    answer: Answer
 
 
-def try_call(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
-    """Calls a producer; returns its answer and None, or None and the error that it raised."""
-    try:
-        return call(), None
-    except Exception as error:
-        return None, error
-
-
-class Production:
+class Production(Asker):
     """Asks producers for requested nodes, and writes their answers into the pools.
 
     Attributes:
@@ -156,11 +137,12 @@ class Production:
     """
 
     def __init__(self, cache: Cache, scheduler: Scheduler, by_level: bool, strict: bool) -> None:
+        super().__init__()
         self.cache, self.scheduler, self.by_level = cache, scheduler, by_level
         self.trees: dict[str, ProducedTree] = {}
         self.failures = Failures(strict)
         self._skipped_count = 0
-        self._waiting: list[_PendingBatch] = []
+        self._answered: list[Answered] = []  # since the last call of `_take_answers`
         self._held_back: list[Answered] = []  # found no room in the staging ring
         self.staging: Staging | None = None
         pool = cache.bricks
@@ -220,8 +202,8 @@ class Production:
             self.write(answers, stats)
 
     def _deepen(self, subdivisions: Requests, stats: FrameStats) -> None:
-        """Subdivides the nodes just made as well, where rays will want finer ones, before they ask:
-        by as many levels as the subdivisions want on average.
+        """Subdivides the nodes that were just made, too, where rays will want finer ones, before
+        rays ask for these: by as many levels as the subdivisions want on average.
         """
         branching = max(source.layout.branching for source in self.trees.values())
         for _ in range(extra_levels(levels_wanted(subdivisions.priority, branching).tolist())):
@@ -235,7 +217,6 @@ class Production:
 
     def ask(self, chosen: Mapping[int, Tensor]) -> list[Answered]:
         """Asks for the chosen (k,) nodes of each kind; returns answers that are here at once."""
-        answered: list[Answered] = []
         for kind, nodes in chosen.items():
             self.scheduler.spent[kind] += len(nodes)
             for source, node in self._by_tree(nodes):
@@ -244,28 +225,23 @@ class Production:
                 if kind == REQUEST_LOAD and source.producer.needs_parent:
                     batch = self._with_parents(batch)
                 failed = self.failures.among(batch)
-                if failed is not None:  # before its tile was given away: mark it again
+                if failed is not None:  # their marks are gone, as when tiles change hands
                     failed_before, batch = batch[failed], batch[~failed]
                     self._mark(failed_before)
                     self._skipped_count += len(failed_before)
                 for part in batch.by_slots():
-                    answered += self._submit(part)
-        return answered
+                    self._submit(part)
+        return self._take_answers()
 
     def late_answers(self) -> list[Answered]:
         """Returns the answers that came since the last call; gives up those that are overdue."""
-        answered = [*self._held_back]
-        self._held_back.clear()
-        for item in list(self._waiting):
-            if item.answer_future.done():
-                seconds = time.monotonic() - item.asked_at
-                self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
-                answered += self._settle(item.batch, *try_call(item.answer_future.result))
-                self._waiting.remove(item)
-            elif item.seconds_left < 0:
-                self._waiting.remove(item)
-                give_up(item.batch, item.producer_future, self._fail)
-        return answered
+        self._answered, self._held_back = self._held_back, []
+        for item in self._take(lambda item: item.answer_future.done()):
+            seconds = time.monotonic() - item.asked_at
+            self.scheduler.learn(item.batch.kind, len(item.batch), 1e3 * seconds)
+            self._settle_late(item)
+        self._give_up_overdue()
+        return self._take_answers()
 
     def write(self, answers: Sequence[Answered], stats: FrameStats) -> None:
         """Writes answers into the pools and adds them to `stats`."""
@@ -294,6 +270,7 @@ class Production:
 
     def restore_pending(self) -> None:
         """Marks the nodes whose answers are on their way as pending, and no others."""
+        self._answered.clear()  # of a frame that was broken off
         request_words = self.cache.nodes.request_tn
         all_nodes = torch.arange(request_words.numel(), device=request_words.device)
         for kind in KINDS.values():
@@ -303,17 +280,13 @@ class Production:
 
     def forget(self, source: ProducedTree) -> None:
         """Drops the answers that are on their way to a tree, and forgets its failures."""
-        for item in [item for item in self._waiting if item.batch.source is source]:
-            item.producer_future.cancel()
-            self._waiting.remove(item)
+        self._cancel(source)
         self._held_back = [item for item in self._held_back if item.batch.source is not source]
         self.failures.forget(source.name)
 
     def close(self) -> None:
         """Drops all answers that are on their way."""
-        for item in self._waiting:
-            item.producer_future.cancel()
-        self._waiting.clear()
+        self._cancel()
         self._held_back.clear()
 
     def __repr__(self) -> str:
@@ -355,19 +328,24 @@ class Production:
         bricks = parents.parent_bricks(cache, source, load_batch.targets.node)
         return replace(load_batch, parents=bricks)
 
-    def _submit(self, batch: RequestBatch) -> list[Answered]:
-        """Asks for a batch; returns the answers that come at once."""
+    def _submit(self, batch: RequestBatch) -> bool:
+        """See `Asker`; the scheduler learns what an answer that comes at once costs."""
         start = time.perf_counter()
-        answer, raised = try_call(batch.ask)
-        if isinstance(answer, Future):
-            if not answer.done():
-                self._mark(batch)
-                future = self._send_on_arrival(batch, answer)
-                self._waiting.append(_PendingBatch(batch, answer, future, time.monotonic()))
-                return []
-            answer, raised = try_call(answer.result)
-        answered = self._settle(batch, answer, raised)
-        self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
+        at_once = super()._submit(batch)
+        if at_once:
+            self.scheduler.learn(batch.kind, len(batch), 1e3 * (time.perf_counter() - start))
+        return at_once
+
+    def _on_future(self, batch: RequestBatch, future: Future) -> None:
+        self._mark(batch)
+        self._wait_for(batch, future, self._send_on_arrival(batch, future))
+
+    def _on_answer(self, batch: RequestBatch, answer: Answer) -> None:
+        self._answered.append(Answered(batch, send_voxels(batch, answer, self.staging)))
+
+    def _take_answers(self) -> list[Answered]:
+        """Returns the answers that have come, each once."""
+        answered, self._answered = self._answered, []
         return answered
 
     def _send_on_arrival(self, batch: RequestBatch, producer_future: Future) -> Future:
@@ -385,16 +363,6 @@ class Production:
 
         producer_future.add_done_callback(send)
         return answer_future
-
-    def _settle(self, batch: RequestBatch, answer: Any, raised: Exception | None) -> list[Answered]:
-        """Checks an answer; if the producer raised, asks it again for each half of the batch."""
-        if raised is not None:
-            halves = halves_to_retry(batch, raised, self._fail)
-            return [answered for half in halves for answered in self._submit(half)]
-        if isinstance(answer, SentBricks):
-            return [Answered(batch, answer)]
-        valid = valid_part(batch, answer, self._fail)
-        return [] if valid is None else [Answered(valid[0], send_voxels(*valid, self.staging))]
 
     def _write_bricks(
         self, kind: Region, batch: RequestBatch, answer: Any, stats: FrameStats
@@ -446,6 +414,5 @@ class Production:
         self.cache.mark_pending(batch.targets.node, batch.kind, lacking)
 
     def _fail(self, batch: RequestBatch, message: str, cause: BaseException | None) -> None:
-        """Records a batch as failed; its nodes stay pending, so that no ray asks again."""
         self._mark(batch)
         self.failures.add(batch, message, cause)

@@ -18,7 +18,7 @@ from torch import Tensor
 from .stats import FrameStats
 
 _STRIDES = (16, 4)  # pixels between scouts
-_FEW_DIVISOR = 16  # if at most one scout in this many is left, the next rays are traced with it
+_FEW_DIVISOR = 16  # if at most one scout in this many misses something, more rays are traced
 
 
 class RaySubsets:
@@ -88,8 +88,9 @@ class RaySubsets:
         self.over = self.done == self.count
 
     def _choose(self, group: Tensor, in_grids: Sequence[int]) -> None:
-        """Sets the next pass to the group's rays on the coarsest grid of which more than 1/16 is in
-        the group, else to the whole group; `in_grids` is the number of its rays on each grid.
+        """Sets the next pass to the group's rays on one grid: the coarsest that has more than 1/16
+        of its rays in the group. If none has, to the whole group. `in_grids` is the number of the
+        group's rays on each grid.
         """
         for grid, size, in_grid in zip(self._grids, self._grid_sizes, in_grids, strict=True):
             if in_grid * _FEW_DIVISOR > size:

@@ -23,10 +23,10 @@ from .production import Production
 from .stats import COARSER_UNIT, Collected, FrameStats, Readbacks
 
 _MIN_LIST = 1 << 14  # how many nodes' requests are listed, unless a batch holds more
-# Factors: most by which a frame widens cones, by which it narrows them, and widest cones.
-_MAX_WIDENING, _NARROWING = 1.2, 0.97
-_MAX_CONE_FACTOR = 64.0
-_ROOMY_FRACTION = 0.85  # share of a pool: if less is used, cones become narrower
+_MAX_WIDENING = 1.2  # largest factor by which cones become wider in a frame
+_NARROWING = 0.97  # factor by which they become narrower in a frame, if there is room
+_ROOMY_FRACTION = 0.85  # share of a pool: if less is needed, there is room
+_MAX_CONE_FACTOR = 64.0  # largest factor by which cones are wider than the camera's
 
 
 class Chosen(NamedTuple):
@@ -97,8 +97,8 @@ class RecordedFrame(ABC):
         """Writes the bricks and node tiles that earlier frames requested."""
 
     def take_host_needed(self, readbacks: Readbacks) -> bool:
-        """Returns whether `Engine.frame` must render the next frame, because it names the nodes
-        that fail and requests the targets of aliases. Resets `host_needed`.
+        """Returns whether `Engine.frame` must render the next frame: because a node failed, which
+        it names, or for aliases, whose targets it requests. Resets `host_needed`.
         """
         needed = readbacks.failed or self.host_needed or len(self.cache.aliases) > 0
         self.host_needed = False
@@ -152,7 +152,7 @@ class RecordedFrame(ABC):
         return Collected(self._listed, numbers)
 
     def to_read_back(self, collected: Collected) -> Collected:
-        """Returns what `finish` left, with what the host is to do once it has this frame's."""
+        """Returns what `finish` left, and what the host is to call once it has been read back."""
         return collected
 
     def _widen_cones(self, used: Tensor, request_counts: Tensor) -> None:

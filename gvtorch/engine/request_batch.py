@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, TERMINAL
-from ..base.messages import reason, with_type
 from ..base.volume import movable
 from ..cache import Cache
 from ..cache.write import Children, Targets
@@ -22,8 +21,6 @@ from ..pool import N3Tree
 from ..pool.staging import SentBricks, Staging, TableRows, on_host, upload
 from ..producers import Bricks, Layout, Nodes, Producer, Region, Regions
 from ..producers.answer import checked_bricks, checked_regions, count_kinds
-
-_MAX_RAISING_CALLS = 256  # for a batch and its parts, which are then given up whole
 
 #: First and last `Region` of the kinds of answers that are written in the same way.
 _WRITTEN_ALIKE = (
@@ -150,60 +147,6 @@ class RequestBatch:
         return check_answer(answer, self.nodes, self.source.producer)
 
 
-class Answered(NamedTuple):
-    """A batch and its answer, checked, without items that failed."""
-
-    batch: RequestBatch
-    answer: Regions | Bricks | SentBricks
-
-
-#: Records a batch as failed: the batch, the message, and the error if the producer raised one.
-Fail = Callable[[RequestBatch, str, BaseException | None], None]
-
-
-def halves_to_retry(
-    batch: RequestBatch, error: BaseException, fail: Fail
-) -> Sequence[RequestBatch]:
-    """Returns the halves of a batch for which the producer raised: asked separately, a bad node
-    fails alone. A single node fails, and so does the batch after too many calls that raised.
-    """
-    if next(batch.raised) > _MAX_RAISING_CALLS or len(batch) == 1:
-        fail(batch, with_type(error), error)
-        return ()
-    middle = len(batch) // 2
-    return batch[:middle], batch[middle:]
-
-
-def give_up(batch: RequestBatch, future: Future, fail: Fail) -> None:
-    """Cancels a batch whose answer has not come in time, and fails it."""
-    future.cancel()
-    fail(batch, batch.source.no_answer, None)
-
-
-def valid_part(
-    batch: RequestBatch, answer: Any, fail: Fail
-) -> tuple[RequestBatch, Regions | Bricks] | None:
-    """Checks an answer. A node fails with the first error among its items, and the whole batch if
-    the answer has the wrong form. Returns the other nodes and their items; None if there are none.
-    """
-    try:
-        checked = batch.check(answer)
-    except Exception as error:  # a user's answer may hold anything
-        fail(batch, reason(error), error)
-        return None
-    if checked.errors:
-        reasons: dict[int, str] = {}  # by index in the batch
-        for item in sorted(checked.errors):
-            reasons.setdefault(item // batch.per_node, checked.errors[item])
-        for index, message in reasons.items():
-            fail(batch[index : index + 1], message, None)
-        kept = torch.ones(len(batch), dtype=torch.bool, device="cpu")
-        kept[list(reasons)] = False
-        items = kept.repeat_interleave(batch.per_node).nonzero()[:, 0]
-        batch, checked = batch[kept.nonzero()[:, 0]], checked.rows(items)
-    return (batch, checked) if len(batch) else None
-
-
 def brick_words(kind: Tensor) -> Tensor:
     """Returns brick words (k,) int32 of nodes whose kinds of `Region` are (k,): EMPTY or CONSTANT
     where no brick is needed, else ABSENT.
@@ -270,7 +213,7 @@ def by_kind(batch: RequestBatch, answer: Bricks) -> dict[Region, tuple[RequestBa
 
 
 def send_voxels(
-    batch: RequestBatch, answer: Regions | Bricks, staging: Staging | None
+    batch: RequestBatch, answer: Regions | Bricks | SentBricks, staging: Staging | None
 ) -> Regions | Bricks | SentBricks:
     """Sends a checked answer to the device if it is only voxels, on the host; else returns it."""
     if staging is None or not isinstance(answer, Bricks) or not on_host(answer.data):

@@ -207,7 +207,9 @@ class Readback:
     def __init__(
         self, stats: FrameStats, collected: Collected, earlier: Iterable[Readback] = ()
     ) -> None:
-        """Starts the copy. `earlier`: readbacks of earlier frames, which may not have asked yet."""
+        """Starts the copy. `earlier`: readbacks of frames whose nodes are pending already, although
+        producers may not have been asked for them yet.
+        """
         self.stats, (self.requests, numbers, self._ask_producers) = stats, collected
         self._earlier_readbacks = tuple(earlier)
         self._asked_count: int | None = None
@@ -250,7 +252,7 @@ class Readback:
 
     def converged(self) -> bool:
         """Returns whether nothing that could be served was missing; waits for the counts."""
-        # The nodes of earlier frames are pending, so this frame does not find them.
+        # This frame did not list what earlier ones are to ask for: it was pending already.
         for readback in self._earlier_readbacks:
             self.pending |= readback.ask() > 0
         self._earlier_readbacks = ()

@@ -64,7 +64,7 @@ class FrameSteps:
         self._missed: Tensor | None = None  # (r,) bool, which rays of the last picture missed
         self._recent_stats: deque[FrameStats] = deque(maxlen=_REPORTED_FRAMES)  # for the report
         self._versions: dict[str, int] = {}  # of the content that the trees hold
-        self.host_frames: list[HostFrame] = []  # captured, with producers on the host
+        self._host_frames: list[HostFrame] = []  # captured, with producers on the host
         try:
             layouts: dict[str, Layout] = {}
             for name, producer in producers.items():
@@ -105,7 +105,7 @@ class FrameSteps:
             with collect_timings(self.device) if monitor else nullcontext() as timings:
                 yield stats
         except BaseException:
-            self.restore_pending()
+            self._restore_pending()
             raise
         end = mark(self.device)
 
@@ -128,7 +128,7 @@ class FrameSteps:
         requests, if an answer is due, if the host is too far ahead, or if `wait` is true.
         """
         self.renew()
-        self.release()
+        self._release()
         newest = self.readbacks.catch_up(wait or self.production.due)
         if self.readbacks:
             return
@@ -145,7 +145,7 @@ class FrameSteps:
         changed = self._changed_trees()
         if not changed:
             return
-        self.release()
+        self._release()
         self.readbacks.catch_up(wait=True)  # their requests are dropped
         for source in changed:
             self.production.forget(source)
@@ -155,31 +155,31 @@ class FrameSteps:
             self._versions[source.name] = version
         self._missed = None
 
-    def release(self, keep: RecordedFrame | None = None) -> None:
-        """Drops the answers that are on their way to captured frames, except those of `keep`, and
-        the frames whose graphs are gone, with their buffers.
+    def _release(self, keep: RecordedFrame | None = None) -> None:
+        """Drops the answers that are on their way to captured frames, except to `keep`. Captured
+        frames whose graphs are gone are dropped altogether, with their buffers.
         """
-        for host_frame in list(self.host_frames):
+        for host_frame in list(self._host_frames):
             if host_frame is not keep:
                 host_frame.release()
             if host_frame.abandoned:
                 host_frame.close()
-                self.host_frames.remove(host_frame)
+                self._host_frames.remove(host_frame)
 
-    def restore_pending(self) -> None:
-        """Marks the nodes whose answers are on their way as pending, and no others: answers to
-        captured frames are dropped, or their nodes would be asked for, and written, twice.
+    def _restore_pending(self) -> None:
+        """Marks the nodes whose answers are on their way as pending, and no others. Answers to
+        captured frames are dropped first: their nodes would be requested again, and written twice.
         """
-        self.release()
+        self._release()
         self.production.restore_pending()
 
     def scout(self, view: View, stats: FrameStats) -> None:
         """Traces some rays before the picture: while answers are written at once, some rays that
         missed something are traced again, and what they miss next is served within this frame.
 
-        They carry the frame number of the last picture: no slot is given away that it or they used,
-        or that was written since. What exceeds the budgets or the pools is left to the whole
-        picture.
+        Scouts stamp what they use with the frame number of the last picture, as a write does. So a
+        slot is kept if that picture used it, if a scout did, or if it was written since. Requests
+        that exceed the budgets or the pools are left to the picture.
         """
         produced_count, hits = 0, None
         for _ in range(self.options.scout_rounds):
@@ -199,14 +199,14 @@ class FrameSteps:
     def trace(
         self, view: View, progress: Progress = no_progress, again: Again | None = None
     ) -> Hits:
-        """Traces a picture's rays, all or some of them `again`, under a new frame number."""
-        self.number_picture()
+        """Traces a picture's rays, or those that `again` selects, under a new frame number."""
+        self._number_picture()
         self.cache.frame_1.fill_(self.frames)
         return view.hits(progress, again=again)
 
-    def number_picture(self) -> None:
-        """Gives the next picture its number, with which rays stamp what they use; on the device it
-        is `Cache.frame_1`, which `trace` writes and graphs count up.
+    def _number_picture(self) -> None:
+        """Gives the next picture its number, with which rays stamp what they use. Its copy on the
+        device, `Cache.frame_1`, is written by `trace`, or counted up by a graph.
         """
         self.frames += 1
         for source in self.trees.values():
@@ -254,7 +254,7 @@ class FrameSteps:
         """
         self._closed = True  # another thread's picture gets no further frame
         with self.lock:
-            for host_frame in self.host_frames:
+            for host_frame in self._host_frames:
                 host_frame.close()
             self.production.close()
             for source in self.trees.values():

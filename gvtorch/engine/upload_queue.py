@@ -1,5 +1,6 @@
 """`UploadQueue`: rows of answers on their way from the host to a recorded frame. Any thread may add
-rows, into pinned memory; a frame sends all added rows in one copy, and the host does not wait.
+rows, which are gathered in pinned memory; a frame sends all of them in one copy, and the host does
+not wait.
 """
 
 from __future__ import annotations
@@ -7,13 +8,14 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..base import check
+from ..pool.staging import Voxels, gather
 
 RowForm = Mapping[str, tuple[tuple[int, ...], torch.dtype]]  # shape and dtype of a row's fields
 
@@ -33,7 +35,7 @@ class UploadQueue:
         """Allocates the buffers; raises ValueError if they are larger than the memory."""
         self.rows, self.sent = rows, 0
         self._lock = threading.Lock()
-        self._queue: deque[tuple[str, Mapping[str, Tensor], int]] = deque()
+        self._queue: deque[tuple[str, Voxels]] = deque()  # found no room in the open buffer
         self._filled_rows = dict.fromkeys(tables, 0)
         self._node_rows = rows * len(tables)  # node fields, at the front of a buffer
         fields: dict[tuple[str, str], tuple[int, tuple[int, ...], torch.dtype]] = {}
@@ -59,12 +61,20 @@ class UploadQueue:
         for buffer in (self._device_buffer, *self._host_buffers):
             self._clear_buffer(buffer)
 
-    def add(self, table: str, rows: Mapping[str, Tensor]) -> None:
-        """Queues rows (k, ...) for a table, in host memory; those without room are sent later."""
-        if len(rows["node"]):
+    def add(self, table: str, rows: Voxels, wanted: Callable[[], bool]) -> None:
+        """Adds rows (k, ...) in host memory to a table, as long as `wanted` is true: it becomes
+        false before `forget`. Those without room are copied, and sent later.
+        """
+        with self._lock:
+            if not wanted():
+                return
+            added = 0 if self._queue else self._fill(table, rows)
+        if added < len(rows["node"]):
+            rest = {name: gather(values[added:]) for name, values in rows.items()}
             with self._lock:
-                self._queue.append((table, rows, 0))
-                self._fill_open_buffer()
+                if wanted():
+                    self._queue.append((table, rest))
+                    self._fill_open_buffer()
 
     def send(self) -> bool:
         """Starts copying the added rows to the device, unless all buffers are still being copied;
@@ -101,17 +111,21 @@ class UploadQueue:
     def _fill_open_buffer(self) -> None:
         """Moves rows from the queue to the open buffer, in their order."""
         while self._queue:
-            table, rows, first = self._queue.popleft()
-            row, total = self._filled_rows[table], len(rows["node"])
-            count = min(self.rows - row, total - first)
-            for name, values in rows.items():
-                self._host_tables[self._open][table][name][row : row + count] = values[
-                    first : first + count
-                ]
-            self._filled_rows[table] += count
-            if first + count < total:
-                self._queue.appendleft((table, rows, first + count))
+            table, rows = self._queue.popleft()
+            added = self._fill(table, rows)
+            if added < len(rows["node"]):
+                rest = {name: values[added:] for name, values in rows.items()}
+                self._queue.appendleft((table, rest))
                 return
+
+    def _fill(self, table: str, rows: Voxels) -> int:
+        """Writes the first rows into the open buffer; returns for how many it had room."""
+        begin = self._filled_rows[table]
+        end = min(self.rows, begin + len(rows["node"]))
+        for name, values in rows.items():
+            gather(values[: end - begin], self._host_tables[self._open][table][name][begin:end])
+        self._filled_rows[table] = end
+        return end - begin
 
     def _clear_buffer(self, buffer: Tensor) -> None:
         buffer[: 8 * self._node_rows].view(torch.int64).fill_(-1)

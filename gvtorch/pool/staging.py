@@ -106,6 +106,13 @@ class TableRows:
 Voxels = Mapping[str, Tensor | TableRows]  # for each channel (k, z, y, x, c)
 
 
+def gather(rows: Tensor | TableRows, out: Tensor | None = None) -> Tensor:
+    """Returns a copy of rows (k, ...), in `out` if that is given."""
+    if isinstance(rows, TableRows):
+        return rows.gather(out)
+    return rows.clone() if out is None else out.copy_(rows)
+
+
 def wide_rows(*tensors: Tensor) -> list[Tensor]:
     """Returns (k, w) views of contiguous tensors in the widest integers that fit all of their rows:
     fewer elements move, and uint16, which torch can't index, becomes int16.
@@ -246,7 +253,7 @@ class Staging:
                     source = rows
                 else:
                     source = self._host_ring[byte_range].view(rows.dtype).view(rows.shape)
-                    rows.gather(source) if isinstance(rows, TableRows) else source.copy_(rows)
+                    gather(rows, source)
                 arriving[name].copy_(source, non_blocking=True)
             if self._stream:
                 span.copied = self._stream.record_event()

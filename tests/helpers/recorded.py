@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 import gvtorch as gv
-from gvtorch.engine.frame_graph import LookAhead
+from gvtorch.cameras.custom import as_camera
+from gvtorch.engine.frame_graph import FrameGraph
 from gvtorch.engine.host_frame import HostFrame
 from gvtorch.engine.setup import make_recorded_frame
 
@@ -56,8 +57,10 @@ def view(size: int = 48, angle: float = 30) -> gv.Camera:
     return gv.Camera.orbit(angle, 20, 0.9, None, size, size)
 
 
-class Frames:
-    """Frames of an engine as they are recorded, but without a CUDA graph, so that a CPU can run."""
+class Frames(FrameGraph):
+    """Frames of an engine as `Engine.capture` records them, but run step by step, without a CUDA
+    graph, so that a CPU can, and never by `Engine.frame`.
+    """
 
     def __init__(
         self,
@@ -68,19 +71,20 @@ class Frames:
         look_ahead: float = 0,
         fit: bool = False,
     ) -> None:
-        self.engine, self.batch = engine, batch
-        first_view = engine.view("test", camera, shader, {})
-        self.view = replace(first_view, numbers=first_view.numbers.clone())
-        self.ahead = LookAhead(self.view, look_ahead) if look_ahead else None
-        self.look_from(camera)
         frame = make_recorded_frame(engine.production, batch, fit)
         assert frame is not None
-        self.served, self.number = frame, -1
+        self.served = frame
+        view = engine.view("test", camera, shader, {})
+        super().__init__(engine, view, frame, partial(engine.frame, shader=shader), look_ahead)
+        self.look_from(camera)
         if isinstance(frame, HostFrame):
-            engine.host_frames.append(frame)
+            engine._host_frames.append(frame)
+
+    def _record(self, step: Callable[[], None]) -> Callable[[], None]:
+        return step
 
     def look_from(self, camera: gv.Camera) -> None:
-        self.camera = camera.placed(self.view.box)
+        self.camera = as_camera("test", camera)
 
     def whole(self, max_frames: int = 200, pause: float = 0.0) -> tuple[gv.Hits, gv.FrameStats]:
         """Draws frames, with pauses in seconds, until one misses nothing; returns that one."""
@@ -92,28 +96,8 @@ class Frames:
         raise AssertionError(f"not whole within {max_frames} frames: {stats.requests}")
 
     def frame(self) -> tuple[gv.Hits, gv.FrameStats]:
-        with self.engine.new_frame(self.view.options) as stats:
-            self.engine.release(keep=self.served)
-            self.engine.readbacks.take_arrived()
-            stale, ahead = self.engine.frames != self.number, self.ahead
-            steady = self.engine.steady and not (ahead and ahead.due)
-            if self.served.begin(stale, steady, stats):
-                self.served.serve()
-                for _ in range(self.engine.readbacks.extra_levels):
-                    self.served.deepen()
-            self.engine.number_picture()
-            self.number = self.engine.frames
-            numbers = self.camera.numbers(self.engine.device)
-            if ahead is not None:
-                ahead.follow(self.camera, numbers, stale)
-            self.view.numbers.copy_(numbers)
-            hits = self.served.draw(self.view, ahead is not None)
-            if ahead is not None and ahead.due:
-                self.served.look_ahead(ahead.hits)
-            collected = self.served.to_read_back(self.served.finish(hits))
-            self.engine.read_back(stats, hits, collected)
-        self.engine.readbacks.hold_back()
-        return hits, stats.settle()
+        _, stats = self._replay(self.camera)
+        return self._hits, stats.settle()
 
 
 Replay = Callable[[gv.Camera], tuple[Tensor, gv.FrameStats]]
