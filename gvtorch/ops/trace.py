@@ -40,6 +40,9 @@ def check_rays(context: str, rays: RayArguments) -> dict[str, int]:
 
 def check_channel(context: str, arguments: TraceArguments, device: torch.device) -> dict[str, int]:
     """Checks the fields of `TraceArguments.channel`: placement, bricks and constants."""
+    place = arguments.place_33
+    if isinstance(place, Tensor) and place.device != device:
+        raise ValueError(f"{context}: the rays are on {device}, the tree is on {place.device}")
     n = check.integer(context, "branching", arguments.branching, low=2, high=config.MAX_BRANCHING)
     fields = _fields(arguments, arguments.bricks_bzyxc.dtype, "bricks_bzyxc constant_tnc")
     placement = _fields(arguments, torch.float64, "place_33")
