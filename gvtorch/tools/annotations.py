@@ -16,9 +16,8 @@ if TYPE_CHECKING:
     from ..viewer.state import ViewState
 
 
-_EQUAL_CONTRAST = (
-    0.18  # luminance, linear: black and white differ from it by the same factor (WCAG)
-)
+#: Luminance, linear, from which black and white differ by the same factor (WCAG).
+_EQUAL_CONTRAST = 0.18
 
 
 @dataclass(frozen=True, kw_only=True)
