@@ -318,7 +318,11 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
     ("body", "name", "message"),
     [
         (ADD.replace("COLOR", "colour"), "Own", r"own.h:8:\d+: error: 'colour' was not declared"),
-        ("", "Own", "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&)"),
+        (
+            "",
+            "Own",
+            "a shader has GV_HD void add(const gv::Interval<T>&, const gv::Probe<T>&, Sum&)",
+        ),
         (ADD, "Mine", "'Mine' does not name a type"),
         (
             "  static float nowhere(T);" + ADD.replace("COLOR", "T(nowhere(1))"),

@@ -275,6 +275,7 @@ def test_normals_of_three_trees_are_the_mean_by_the_light_that_each_takes():
             SimpleNamespace(
                 shader=gv.TransferFunction([(0, 0), (1, 1)]),
                 to_tree=lambda rays: rays,
+                learned=list,
                 tree=SimpleNamespace(box=box),
             ),
         )

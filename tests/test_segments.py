@@ -269,8 +269,8 @@ def gradients(walked, weight) -> list[Tensor]:
 @pytest.mark.parametrize("real", [torch.float32, torch.float64])
 @pytest.mark.parametrize("branching", [2, 3])
 def test_gradients_have_the_same_bits_in_every_run(blobs, compiled, branching, real, monkeypatch):
-    """Whatever the number of threads, and on a GPU as on a CPU; with bricks in many pieces."""
-    monkeypatch.setattr("gvtorch.ops.segments._PIECE_ENTRIES", 5)
+    """Whatever the number of threads, and on a GPU as on a CPU; with bricks in many portions."""
+    monkeypatch.setattr("gvtorch.ops.segments._PORTION_ENTRIES", 5)
     tree = gv.N3Tree.from_volume(blobs, 4, branching=branching)
     rays, threads = camera_rays(tree, 24, distance=1.5), torch.get_num_threads()
     results = []
@@ -288,7 +288,7 @@ def test_gradients_have_the_same_bits_in_every_run(blobs, compiled, branching, r
     assert all((grad != 0).sum() > 100 for grad in results[0])
     for result in results[1:]:
         assert all(map(torch.equal, result, results[0]))
-    monkeypatch.undo()  # in whole pieces: other roundings
+    monkeypatch.undo()  # in whole portions: other roundings
     for grad, expected in zip(gradients(walked, weight), results[0], strict=True):
         torch.testing.assert_close(grad.cpu(), expected, rtol=1e-4, atol=1e-4)
 

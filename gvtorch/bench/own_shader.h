@@ -7,7 +7,7 @@ template <class T>
 struct PlainTransfer : gv::UserShader<T> {
   using gv::UserShader<T>::UserShader;
 
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-    this->composite(this->look_up(piece.value, piece), piece, sum);
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    this->composite(this->look_up(interval.value, interval), interval, sum);
   }
 };

@@ -18,7 +18,7 @@ from .registry import Backend, argument_names, choose_backend, fake_of, runs_twi
 from .trace import check_channel, check_rays, check_real, check_trace, check_voxels
 
 _SEGMENT_BYTES = 84  # at most, in float64
-_PIECE_ENTRIES = 256  # most entries of a piece; see `_spreading_order`
+_PORTION_ENTRIES = 256  # most entries of a portion; see `_spreading_order`
 #: Arguments of `sample_bricks` that have gradients.
 _DIFFERENTIABLE = ("bricks_bzyxc", "constant_tnc")
 
@@ -247,8 +247,8 @@ def _spreading_order(
     segment_k: Tensor, node_s2: Tensor, brick_s2: Tensor, bricks: int, nodes: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Returns in what order the gradient of `sample_bricks` is added up: (e,) sorted entries, their
-    segments (e,) and lengths (e,), (p + 1,) first entries of pieces, (p,) rows of pieces, and (x,)
-    the pieces with rows; see `SpreadGradient` in csrc/shaders/segments.h.
+    segments (e,) and lengths (e,), the portions' first entries (p + 1,) and rows (p,), and (x,) the
+    portions with rows; see `SpreadGradient` in csrc/shaders/segments.h.
     """
     if not len(node_s2):
         segment_k = segment_k[:0]
@@ -268,12 +268,12 @@ def _spreading_order(
     index = torch.arange(len(target), device=target.device)
     number = index - begins.nonzero()[:, 0][begins.cumsum(0) - 1]  # among those of its target
     count = exists.sum().view(1)
-    piece = ((number % _PIECE_ENTRIES == 0) & (index < count)).nonzero()[:, 0]
-    is_added = number[piece] > 0
+    portion = ((number % _PORTION_ENTRIES == 0) & (index < count)).nonzero()[:, 0]
+    is_added = number[portion] > 0
     row = torch.where(is_added, is_added.cumsum(0) - 1, -1)
     entry = torch.stack((2 * run, 2 * run + 1), 1).flatten()[order]
-    pieces = torch.cat((piece, count)), row, is_added.nonzero()[:, 0]
-    return entry, segment[order // 2], length[order // 2], *pieces
+    portions = torch.cat((portion, count)), row, is_added.nonzero()[:, 0]
+    return entry, segment[order // 2], length[order // 2], *portions
 
 
 def _begins(values: Tensor) -> Tensor:
@@ -286,8 +286,8 @@ def _begins(values: Tensor) -> Tensor:
 @_spreading_order.register_fake
 def _fake_order(segment_k: Tensor, *_: Any) -> tuple[Tensor, ...]:
     size = torch.library.get_ctx().new_dynamic_size
-    runs, pieces, rows = size(), size(), size()
-    counts, long = (pieces + 1, pieces, rows), torch.int64
+    runs, portions, rows = size(), size(), size()
+    counts, long = (portions + 1, portions, rows), torch.int64
     entries = (segment_k.new_empty(2 * runs, dtype=dtype) for dtype in (long, None, None))
     return (*entries, *(segment_k.new_empty(count, dtype=long) for count in counts))
 

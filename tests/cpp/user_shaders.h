@@ -10,8 +10,8 @@ template <class T>
 struct Plain : gv::UserShader<T> {
   using gv::UserShader<T>::UserShader;
 
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-    this->composite(this->look_up(piece.value, piece), piece, sum);
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    this->composite(this->look_up(interval.value, interval), interval, sum);
   }
 };
 
@@ -21,19 +21,19 @@ struct LitFeatures : gv::UserShader<T> {
   using gv::UserShader<T>::UserShader;
   static constexpr int32_t kFeatures = gv::UserShader<T>::kAsOther;
 
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
-    gv::Row<T> row = this->look_up(piece.value, piece);
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
+    gv::Row<T> row = this->look_up(interval.value, interval);
     if (row.alpha > 0) {
       const T share = sum.clear * row.alpha;
       const gv::ChannelView& other = probe.channels.other;
       for (int32_t c = 0; c < other.width; ++c) {
-        sum.feature_c[c] = sum.feature_c[c] + share * probe.number_at(other, c, piece.middle);
+        sum.feature_c[c] = sum.feature_c[c] + share * probe.number_at(other, c, interval.middle);
       }
-      const gv::Vec3<T> normal = this->light.normal(probe, piece.middle);
-      row = this->light.shade(row, normal, probe, piece.middle);
+      const gv::Vec3<T> normal = this->light.normal(probe, interval.middle);
+      row = this->light.shade(row, normal, probe, interval.middle);
       sum.add_normal(normal, share);
     }
-    this->composite(row, piece, sum);
+    this->composite(row, interval, sum);
   }
 };
 
@@ -48,14 +48,14 @@ struct Highest : gv::UserShader<T> {
   };
 
   GV_HD bool hides(T, T high, const Sum& sum) const { return gv::a_little_above(high) <= sum.found; }
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, Sum& sum) const {
-    if (!(piece.value > sum.found)) return;
-    sum.found = piece.value;
-    sum.at = piece.middle;
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, Sum& sum) const {
+    if (!(interval.value > sum.found)) return;
+    sum.found = interval.value;
+    sum.at = interval.middle;
   }
   GV_HD void done(Sum& sum) const {
     if (!(sum.found > -INFINITY)) return;
-    gv::Piece<T> whole{};
+    gv::Interval<T> whole{};
     whole.level = 0;
     const gv::Row<T> row = this->look_up(sum.found, whole);
     sum.red = row.red;
@@ -75,10 +75,10 @@ struct FirstEnd : gv::UserShader<T> {
   static constexpr bool kEnds = true, kSurface = true;
 
   GV_HD bool hides(T, T high, const gv::ShadeSum<T>&) const { return gv::a_little_above(high) < this->uniform(level); }
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-    if (piece.back < this->uniform(level)) return;
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    if (interval.back < this->uniform(level)) return;
     sum.clear = 0;
-    sum.depth = piece.end;
+    sum.depth = interval.end;
   }
   GV_HD void surface(const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
     sum.red = probe.value(sum.depth);
@@ -94,9 +94,9 @@ struct Above : gv::UserShader<T> {
   static constexpr bool kHidesAlike = true;
 
   GV_HD bool hides(T, T high, const gv::ShadeSum<T>&) const { return gv::a_little_above(high) < this->uniform(level); }
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-    const T over = piece.value - this->uniform(level);
-    if (over > 0) this->composite({piece.value, over, 1, static_cast<T>(0.1)}, piece, sum);
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    const T over = interval.value - this->uniform(level);
+    if (over > 0) this->composite({interval.value, over, 1, static_cast<T>(0.1)}, interval, sum);
   }
 };
 
@@ -124,15 +124,15 @@ struct Contours : gv::UserShader<T> {
   GV_HD bool hides(T, T high, const Sum& sum) const {
     return gv::a_little_above(high) < wanted(sum) || sum.clear < this->uniform(least);
   }
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>& probe, Sum& sum) const {
-    sum.ends[0] = piece.start;
-    sum.ends[1] = piece.end;
-    if (piece.back < wanted(sum) || sum.clear < this->uniform(least)) return;
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>& probe, Sum& sum) const {
+    sum.ends[0] = interval.start;
+    sum.ends[1] = interval.end;
+    if (interval.back < wanted(sum) || sum.clear < this->uniform(least)) return;
     ++sum.found;
-    sum.red = sum.red + sum.clear * probe.value(piece.middle);
-    sum.blue = sum.blue + sum.clear * piece.front;
+    sum.red = sum.red + sum.clear * probe.value(interval.middle);
+    sum.blue = sum.blue + sum.clear * interval.front;
     sum.clear = sum.clear * static_cast<T>(0.75);
-    if (!(sum.depth < INFINITY)) sum.depth = piece.end;
+    if (!(sum.depth < INFINITY)) sum.depth = interval.end;
   }
   GV_HD void surface(const gv::Probe<T>& probe, Sum& sum) const {
     sum.green = probe.value(sum.depth);
@@ -150,12 +150,12 @@ struct Bands : gv::UserShader<T> {
   using gv::UserShader<T>::UserShader;
   GV_UNIFORMS(density, width, fade);
 
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
-    const gv::Vec3<T> place = probe.sight.at(piece.middle);
-    const T light = exp(-(piece.middle + probe.sight.moved) * this->uniform(fade));
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>& probe, gv::ShadeSum<T>& sum) const {
+    const gv::Vec3<T> place = probe.sight.at(interval.middle);
+    const T light = exp(-(interval.middle + probe.sight.moved) * this->uniform(fade));
     const T wave = static_cast<T>(0.5) + static_cast<T>(0.5) * sin(place.z / this->uniform(width));
-    const T alpha = 1 - exp(-this->uniform(density) * gv::larger(piece.value, static_cast<T>(0)) * piece.length);
-    this->composite({light * wave, light * (1 - wave), light * static_cast<T>(0.5), alpha}, piece, sum);
+    const T alpha = 1 - exp(-this->uniform(density) * gv::larger(interval.value, static_cast<T>(0)) * interval.length);
+    this->composite({light * wave, light * (1 - wave), light * static_cast<T>(0.5), alpha}, interval, sum);
   }
 };
 

@@ -90,6 +90,6 @@ def write_header(folder: Path, body: str, name: str = "own.h") -> Path:
 
 
 ADD = """
-  GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-    this->composite({COLOR, 0, 0, 1}, piece, sum);
+  GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+    this->composite({COLOR, 0, 0, 1}, interval, sum);
   }"""

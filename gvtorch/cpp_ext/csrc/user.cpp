@@ -21,8 +21,8 @@ using UserShaderOf = GV_USER_SHADER<T>;  // the name given to CompiledShader: a 
 namespace gvtorch {
 
 // Never called: used only to test whether such calls compile.
-constexpr auto kCallAdd = [](auto& shader, auto& piece, auto& probe,
-                             auto& sum) -> decltype(shader.add(piece, probe, sum), void()) {};
+constexpr auto kCallAdd = [](auto& shader, auto& interval, auto& probe,
+                             auto& sum) -> decltype(shader.add(interval, probe, sum), void()) {};
 constexpr auto kCallSurface = [](auto& shader, auto& probe, auto& sum) -> decltype(shader.surface(probe, sum), void()) {
 };
 
@@ -31,7 +31,7 @@ template <class T, class Shader>
 struct Interface {
   using Sum = typename Shader::Sum;
   static constexpr bool kAdds =
-      std::is_invocable_v<decltype(kCallAdd), const Shader&, const Piece<T>&, const Probe<T>&, Sum&>;
+      std::is_invocable_v<decltype(kCallAdd), const Shader&, const Interval<T>&, const Probe<T>&, Sum&>;
   static constexpr bool kHasSurface = std::is_invocable_v<decltype(kCallSurface), const Shader&, const Probe<T>&, Sum&>;
 
   static_assert(std::is_base_of_v<UserShader<T>, Shader>, "a shader is derived from gv::UserShader<T>");
@@ -39,7 +39,7 @@ struct Interface {
                 "a shader is made from gv::ShadeArgs: using gv::UserShader<T>::UserShader;");
   static_assert(std::is_trivially_copyable_v<Shader>, "a shader is copied into the kernel: plain values only");
   static_assert(std::is_base_of_v<ShadeSum<T>, Sum>, "a shader's Sum is derived from gv::ShadeSum<T>");
-  static_assert(kAdds, "a shader has GV_HD void add(const gv::Piece<T>&, const gv::Probe<T>&, Sum&) const");
+  static_assert(kAdds, "a shader has GV_HD void add(const gv::Interval<T>&, const gv::Probe<T>&, Sum&) const");
   static_assert(!Shader::kSurface || kHasSurface,
                 "a shader of kSurface has GV_HD void surface(const gv::Probe<T>&, Sum&) const");
   static_assert(Shader::kFeatures >= Shader::kAsOther, "kFeatures is a number, or kAsOther");

@@ -8,9 +8,9 @@
 //     GV_UNIFORMS(density);  // CompiledShader("fog.h", "Fog", uniforms={"density": 0.1})
 //     using gv::UserShader<T>::UserShader;
 //
-//     GV_HD void add(const gv::Piece<T>& piece, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
-//       const T alpha = 1 - exp(-this->uniform(density) * piece.value * piece.length);
-//       this->composite({1, 1, 1, alpha}, piece, sum);
+//     GV_HD void add(const gv::Interval<T>& interval, const gv::Probe<T>&, gv::ShadeSum<T>& sum) const {
+//       const T alpha = 1 - exp(-this->uniform(density) * interval.value * interval.length);
+//       this->composite({1, 1, 1, alpha}, interval, sum);
 //     }
 //   };
 //
@@ -57,12 +57,14 @@ struct UserShader : ShaderFacts {
   GV_HD T uniform(int32_t index) const { return uniform_k[index]; }
 
   // The transfer function's colour of a value, and its alpha over the interval.
-  GV_HD Row<T> look_up(T value, const Piece<T>& piece) const {
-    return gvtorch::look_up(Transfer<T>(transfer), value, piece, step);
+  GV_HD Row<T> look_up(T value, const Interval<T>& interval) const {
+    return gvtorch::look_up(Transfer<T>(transfer), value, interval, step);
   }
 
   // Composites an interval behind the previous ones: its colour (not premultiplied) and alpha.
-  GV_HD void composite(const Row<T>& row, const Piece<T>& piece, ShadeSum<T>& sum) const { sum.add(row, piece); }
+  GV_HD void composite(const Row<T>& row, const Interval<T>& interval, ShadeSum<T>& sum) const {
+    sum.add(row, interval);
+  }
 
   // True if the transfer function shows no value in [low, high].
   GV_HD bool hides(T low, T high, const ShadeSum<T>&) const { return Transfer<T>(transfer).transparent(low, high); }
@@ -112,7 +114,9 @@ struct CalledShader : Kind<T> {
   using Sum = typename Base::Sum;
   static constexpr bool kHidesAlike = kHidesByTransfer<Base> || Base::kHidesAlike;
 
-  GV_HD void add(bool, const Piece<T>& piece, const Probe<T>& probe, Sum& sum) const { Base::add(piece, probe, sum); }
+  GV_HD void add(bool, const Interval<T>& interval, const Probe<T>& probe, Sum& sum) const {
+    Base::add(interval, probe, sum);
+  }
 
 #ifndef __CUDACC__
   template <class V>
@@ -121,36 +125,36 @@ struct CalledShader : Kind<T> {
   static constexpr bool kLeavesOut = kHidesByTransfer<Base> && std::is_same_v<Sum, ShadeSum<T>> && !Base::kEnds;
 
   template <class Packet>
-  GV_HD void add(Mask mask, const Piece<Floats>& pieces, Packet& packet, UserSums<Sum>& sums) const {
-    if constexpr (kLeavesOut) mask = mask && !this->transfer.transparent(pieces.value, pieces.value);
+  GV_HD void add(Mask mask, const Interval<Floats>& intervals, Packet& packet, UserSums<Sum>& sums) const {
+    if constexpr (kLeavesOut) mask = mask && !this->transfer.transparent(intervals.value, intervals.value);
     // The gradients of all lanes at once take about as long as two lanes' one by one.
     const bool prefetch = sums.gradient_requests >= 2;
     Vec3<Floats> slope{};
-    if (prefetch) slope = packet.gradient(pieces.middle);
+    if (prefetch) slope = packet.gradient(intervals.middle);
     sums.gradient_requests = 0;
     PrefetchedGradient<float> prefetched{NAN, {}, false};
     packet.each_lane(
         mask,
         [&](int lane, const Probe<T>& probe) {
-          if (prefetch) prefetched = {pieces.middle[lane], lane_of(slope, lane), false};
+          if (prefetch) prefetched = {intervals.middle[lane], lane_of(slope, lane), false};
           prefetched.requested = false;
-          add_lane(lane, pieces, probe, sums);
+          add_lane(lane, intervals, probe, sums);
           sums.gradient_requests += prefetched.requested ? 1 : 0;
         },
         &prefetched);
   }
 
  private:
-  GV_CALL void add_lane(int lane, const Piece<Floats>& pieces, const Probe<T>& probe, UserSums<Sum>& sums) const {
-    auto piece = take_lane<Piece<float>>(pieces, lane);
+  GV_CALL void add_lane(int lane, const Interval<Floats>& intervals, const Probe<T>& probe, UserSums<Sum>& sums) const {
+    auto interval = take_lane<Interval<float>>(intervals, lane);
     if constexpr (Base::kEnds) {
-      piece.front = pieces.front[lane];
-      piece.back = pieces.back[lane];
+      interval.front = intervals.front[lane];
+      interval.back = intervals.back[lane];
     } else {
-      piece.value = pieces.value[lane];
+      interval.value = intervals.value[lane];
     }
     Sum& sum = sum_of(sums, lane);
-    Base::add(piece, probe, sum);
+    Base::add(interval, probe, sum);
     put_lane(sums, lane, sum);
   }
 #endif

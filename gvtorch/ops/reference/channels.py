@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .exact import absorbed_by, larger
 from .lit import Lit
-from .march import Piece, Probe, Transfer
+from .march import Interval, Probe, Transfer
 from .tree import ChannelBricks
 
 
@@ -51,18 +51,18 @@ class ChannelTable:
             hidden = hidden & rows.transparent(low[:, rows.component], high[:, rows.component])
         return hidden
 
-    def interval(self, piece: Piece, probe: Probe) -> Tensor:
+    def interval(self, interval: Interval, probe: Probe) -> Tensor:
         """Returns (r, 4) premultiplied colours and alphas of intervals."""
-        total = torch.zeros_like(piece.middle)
+        total = torch.zeros_like(interval.middle)
         color = total[:, None].expand(-1, 3)
-        level = torch.where(piece.odd, 0, piece.level)
-        numbers = probe.numbers(probe.channel, piece.middle)
+        level = torch.where(interval.odd, 0, interval.level)
+        numbers = probe.numbers(probe.channel, interval.middle)
         for rows in self.channels:
             row = rows.look_up(numbers[:, rows.component], level)
             halvings = row[:, 3]
             color = color + halvings[:, None] * row[:, :3]
             total = larger(total, halvings) if self.additive else total + halvings
-        alpha = absorbed_by(torch.where(piece.odd, total * piece.lengths, total))
+        alpha = absorbed_by(torch.where(interval.odd, total * interval.lengths, total))
         scale = alpha / torch.where(total > 0, total, 1.0)
         return torch.cat((color * scale[:, None], alpha[:, None]), 1)
 
@@ -79,7 +79,7 @@ class ChannelMix(Lit):
     def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
         return self.table.transparent(low, high)
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        rgba = self.table.interval(piece, probe)
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        rgba = self.table.interval(interval, probe)
         self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], mask)
-        self.sum.absorb(rgba[:, 3], piece, mask)
+        self.sum.absorb(rgba[:, 3], interval, mask)

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..shading import Number
 from .exact import clamp, dot, larger, smaller, stretch, unit
 from .lit import Lit
-from .march import Piece, Probe
+from .march import Interval, Probe
 from .rays import INF
 from .tree import ChannelBricks, Holder
 
@@ -97,13 +97,13 @@ class Labels(Lit):
         before = self.transfer.opaque_m[(first - 1).clamp(min=0)]
         return self.transfer.opaque_m[last] == torch.where(first > 0, before, 0)
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         fine, coarse = probe.nodes.fine, probe.nodes.coarse
-        blended = probe.blend(piece.middle, partial(self.contribution, piece))
+        blended = probe.blend(interval.middle, partial(self.contribution, interval))
         color, alpha, normal = blended.split((3, 1, 3), 1)
-        hidden = ~(self.contribution(piece, fine)[:, 3] > 0)
+        hidden = ~(self.contribution(interval, fine)[:, 3] > 0)
         holder = fine.index_put((hidden.nonzero()[:, 0],), coarse[hidden])
-        label = self.row_of(self.channel.nearest(holder, piece.middle).value)
+        label = self.row_of(self.channel.nearest(holder, interval.middle).value)
         clear, hit_clear = self.sum.clear, self.sum.hit_clear
         clear_after = clear * (1 - alpha[:, 0])
         hit = mask & (clear_after < hit_clear) & (clear >= hit_clear)
@@ -111,21 +111,21 @@ class Labels(Lit):
         shown = mask & (alpha[:, 0] > 0)
         self.add_normal(clear[:, None] * normal, shown)
         self.sum.add_light(clear[:, None] * color, shown)
-        self.sum.absorb(alpha[:, 0], piece, shown)
+        self.sum.absorb(alpha[:, 0], interval, shown)
 
     def row_of(self, label: Tensor) -> Tensor:
         """Returns (r,) int64 table rows of labels."""
         low, last = self.transfer.domain_2[0], len(self.transfer.opaque_m) - 1
         return clamp(label - low, 0, last).to(torch.int64)
 
-    def contribution(self, piece: Piece, holder: Holder) -> Tensor:
+    def contribution(self, interval: Interval, holder: Holder) -> Tensor:
         """Returns (r, 7) what a node shows: premultiplied colours, alphas, normals times alpha."""
-        t, table = piece.middle, self.transfer.table_lm4
+        t, table = interval.middle, self.transfer.table_lm4
         nearest = self.channel.nearest(holder, t)
-        level = torch.where(piece.odd, 0, piece.level)
+        level = torch.where(interval.odd, 0, interval.level)
         color, alpha = table[level, self.row_of(nearest.value)].split((3, 1), 1)
-        stretched = stretch(alpha[:, 0], piece.lengths)[:, None]
-        alpha = torch.where((piece.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
+        stretched = stretch(alpha[:, 0], interval.lengths)[:, None]
+        alpha = torch.where((interval.odd & (alpha[:, 0] > 0))[:, None], stretched, alpha)
         normal = torch.zeros_like(color)
         if self.light.parameters.own_as(LabelNumbers).lit > 0:
             voxels = self.channel.toward_others(holder, nearest)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..shading import FAINT, LightKind, ShadeParameters
 from .exact import clamp, divide, dot, larger, power, smaller, sqrt_exact, unit
-from .march import Piece, Plain, Probe, Visitor, Walk
+from .march import Interval, Plain, Probe, Visitor, Walk
 from .rays import INF, Intervals, rounded
 from .tree import ChannelBricks
 
@@ -265,6 +265,6 @@ class ShadowVisitor(Visitor):
     def goes_on(self, leaving: Tensor) -> Tensor:
         return self.clear > self.stop_clear
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        clear = self.clear * (1 - self.shader.alpha(piece, probe, self.direction))
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        clear = self.clear * (1 - self.shader.alpha(interval, probe, self.direction))
         self.clear = torch.where(mask, clear, self.clear)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..shading import LightKind
 from .light import Light, Shadows
-from .march import Piece, Plain, Probe, Walk
+from .march import Interval, Plain, Probe, Walk
 from .tree import ChannelBricks
 
 
@@ -44,12 +44,12 @@ class Lit(Plain):
         varies = self.light.parameters.light_kind == LightKind.POINT and has_normals
         return (same | (fine == coarse)) & (self.shadows is None) & (not varies)
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        self.lit(self.rgba(piece, probe), piece, probe, mask)
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        self.lit(self.rgba(interval, probe), interval, probe, mask)
 
-    def lit(self, rgba: Tensor, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def lit(self, rgba: Tensor, interval: Interval, probe: Probe, mask: Tensor) -> None:
         """Lights an interval and adds it."""
-        t, shown = piece.middle, mask & (rgba[:, 3] > 0)
+        t, shown = interval.middle, mask & (rgba[:, 3] > 0)
         normal = self.light.normal_at(probe, t)
         is_headlight = self.light.parameters.light_kind == LightKind.HEADLIGHT
         shadow = None  # no shadows
@@ -59,7 +59,7 @@ class Lit(Plain):
         color = torch.where(shown[:, None], color, rgba[:, :3])
         weight = self.sum.clear * rgba[:, 3]
         self.add_normal(weight[:, None] * normal, shown)
-        self.sum.add(torch.cat((color, rgba[:, 3:]), 1), piece, mask)
+        self.sum.add(torch.cat((color, rgba[:, 3:]), 1), interval, mask)
 
     def add_normal(self, normal: Tensor, mask: Tensor) -> None:
         """Adds normals (r, 3), weighted by light, where `mask` is true."""

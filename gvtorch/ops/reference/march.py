@@ -115,7 +115,7 @@ class Probe:
 
 
 @dataclass
-class Piece:
+class Interval:
     """An interval of each ray: whole, or odd (of any other length)."""
 
     start: Tensor  # (r,)
@@ -143,17 +143,17 @@ class ShadeSum:
         """Returns colours (r, 3), alphas (r, 1) and world depths (r, 1)."""
         return self.color, (1 - self.clear)[:, None], (self.depth + beam.moved)[:, None]
 
-    def add(self, rgba: Tensor, piece: Piece, mask: Tensor) -> None:
+    def add(self, rgba: Tensor, interval: Interval, mask: Tensor) -> None:
         """Adds an interval with colour and alpha (r, 4) where `mask` is true."""
         share = self.clear * rgba[:, 3]
         self.add_light(share[:, None] * rgba[:, :3], mask)
-        self.absorb(rgba[:, 3], piece, mask)
+        self.absorb(rgba[:, 3], interval, mask)
 
     def add_light(self, color: Tensor, mask: Tensor) -> None:
         """Adds light (r, 3) that reaches the eye, where `mask` is true."""
         self.color = torch.where(mask[:, None], self.color + color, self.color)
 
-    def absorb(self, alpha: Tensor, piece: Piece, mask: Tensor) -> None:
+    def absorb(self, alpha: Tensor, interval: Interval, mask: Tensor) -> None:
         """Multiplies the transmittance by 1 - alpha where `mask` is true. Depth is where inside
         the interval the transmittance falls to hit_clear, as if the interval were homogeneous.
         """
@@ -165,7 +165,7 @@ class ShadeSum:
             fraction = log2_exact(torch.where(hit, self.hit_clear / self.clear, 1.0))
             fraction = fraction / log2_exact(torch.where(hit & ~opaque, transmittance, 0.5))
             fraction = torch.where(opaque, 0.0, clamp(fraction, 0, 1))
-            self.depth = torch.where(hit, piece.start + fraction * piece.length, self.depth)
+            self.depth = torch.where(hit, interval.start + fraction * interval.length, self.depth)
         self.clear = torch.where(mask, clear_after, self.clear)
 
 
@@ -197,15 +197,15 @@ class Transfer:
         table_level = torch.zeros_like(row) if level is None else level
         return mix(self.table_lm4[table_level, row], self.table_lm4[table_level, row + 1], weight)
 
-    def interval(self, value: Tensor, piece: Piece) -> Tensor:
+    def interval(self, value: Tensor, interval: Interval) -> Tensor:
         """Returns (r, 4) linear RGB and the alpha of an interval of one value."""
-        whole_rgba = self.look_up(value, piece.level)
-        if not piece.odd.any():
+        whole_rgba = self.look_up(value, interval.level)
+        if not interval.odd.any():
             return whole_rgba
         odd_rgba = self.look_up(value)
-        alpha = stretch(odd_rgba[:, 3], piece.lengths)[:, None]
+        alpha = stretch(odd_rgba[:, 3], interval.lengths)[:, None]
         odd_rgba = torch.cat((odd_rgba[:, :3], alpha), 1)
-        return torch.where(piece.odd[:, None], odd_rgba, whole_rgba)
+        return torch.where(interval.odd[:, None], odd_rgba, whole_rgba)
 
     def transparent(self, smallest: Tensor, largest: Tensor) -> Tensor:
         """Returns bools: no value between the two has an opacity."""
@@ -251,7 +251,7 @@ class Visitor(ABC):
         """Returns (r,) bool: the ray has not ended; `leaving` (r,): it is between two nodes."""
 
     @abstractmethod
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         """Adds an interval where `mask` (r,) is true."""
 
 
@@ -295,10 +295,10 @@ class Walk:
             length = torch.where(odd, end - start, length)
             middle = torch.where(visit.uniform, start + length * 0.5, middle)
             lengths = divide(length, intervals.length_l[0], length)
-            piece = Piece(start, end, middle, length, lengths, odd, level, base, count)
+            interval = Interval(start, end, middle, length, lengths, odd, level, base, count)
             sampled = active & ~visit.invisible
             self.samples = self.samples + sampled.to(torch.int32)
-            visitor.add(piece, Probe(intervals.beam, visit, self.channel), sampled)
+            visitor.add(interval, Probe(intervals.beam, visit, self.channel), sampled)
             leaving = one_step | ~stays
             active = intervals.inside() & visitor.goes_on(leaving)
 
@@ -355,16 +355,16 @@ class Plain(Visitor):
     def goes_on(self, leaving: Tensor) -> Tensor:
         return self.sum.clear > self.stop_clear
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        self.sum.add(self.rgba(piece, probe), piece, mask)
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        self.sum.add(self.rgba(interval, probe), interval, mask)
 
-    def rgba(self, piece: Piece, probe: Probe) -> Tensor:
+    def rgba(self, interval: Interval, probe: Probe) -> Tensor:
         """Returns (r, 4) colours and alphas of intervals by the transfer function."""
-        return self.transfer.interval(probe.value(piece.middle), piece)
+        return self.transfer.interval(probe.value(interval.middle), interval)
 
-    def alpha(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
+    def alpha(self, interval: Interval, probe: Probe, direction: Tensor) -> Tensor:
         """Returns (r,) alphas of intervals, seen along the directions `direction` (r, 3)."""
-        return self.rgba(piece, probe)[:, 3]
+        return self.rgba(interval, probe)[:, 3]
 
 
 def trace_rays(

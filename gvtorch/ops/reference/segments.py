@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..arguments import RayArguments, Samples, Segments, TraceArguments
-from .march import NodePair, Piece, Probe, Transfer, Visitor, Walk
+from .march import Interval, NodePair, Probe, Transfer, Visitor, Walk
 from .rays import Beam
 from .tree import ChannelBricks, Levels
 
@@ -39,18 +39,18 @@ class SegmentWriter(Visitor):
     def goes_on(self, leaving: Tensor) -> Tensor:
         return ~(leaving & (self.limit > 0) & (self.walk.samples >= self.limit))
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        visit, odd, ray_index = self.walk.visit, piece.odd, mask.nonzero()[:, 0]
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        visit, odd, ray_index = self.walk.visit, interval.odd, mask.nonzero()[:, 0]
         fine, coarse = visit.fine, visit.coarse
         columns = (
             self.walk.visits,
             torch.stack((fine.node, coarse.node), 1),
             torch.stack((fine.brick, coarse.brick), 1),
             torch.stack((fine.depth, coarse.depth, visit.wanted), 1),
-            *(visit.lookup_t, piece.start, piece.end),
-            torch.where(odd, piece.start, piece.base),
-            torch.where(odd, 0.0, piece.count),
-            torch.where(odd, _ODD, piece.level),
+            *(visit.lookup_t, interval.start, interval.end),
+            torch.where(odd, interval.start, interval.base),
+            torch.where(odd, 0.0, interval.count),
+            torch.where(odd, _ODD, interval.level),
         )
         self.parts.append((ray_index, *(column[ray_index] for column in columns)))
 

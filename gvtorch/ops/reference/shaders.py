@@ -20,7 +20,7 @@ from .exact import clamp, dot, larger, sqrt_exact, stretch, unit
 from .labels import Labels
 from .light import Light, Shadows
 from .lit import Lit
-from .march import Piece, Probe, Walk, a_little_above, a_little_below, mix
+from .march import Interval, Probe, Walk, a_little_above, a_little_below, mix
 from .rays import INF
 from .stored_color import Filtered, FilteredLit, StoredColor
 
@@ -32,10 +32,10 @@ class PreIntegrated(Lit):
 
     integrates = True
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        lengths = torch.where(piece.odd, piece.lengths, 1.0)
-        level = torch.where(piece.odd, 0, piece.level)
-        end_values = probe.value(piece.start), probe.value(piece.end)
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        lengths = torch.where(interval.odd, interval.lengths, 1.0)
+        level = torch.where(interval.odd, 0, interval.level)
+        end_values = probe.value(interval.start), probe.value(interval.end)
         low, high = self.transfer.domain_2
         front, back = (clamp(value, low, high) for value in end_values)
         row = self._between(front, back, level)
@@ -51,7 +51,7 @@ class PreIntegrated(Lit):
         mixed = _over(mixed, with_change(self._between(back, back, level), end_values[1] - back))
         rgba = torch.where(inside[:, None], _with_length(row, lengths), mixed)
         self.sum.add_light(self.sum.clear[:, None] * rgba[:, :3], mask)
-        self.sum.absorb(rgba[:, 3], piece, mask)
+        self.sum.absorb(rgba[:, 3], interval, mask)
 
     def _between(self, front: Tensor, back: Tensor, level: Tensor) -> Tensor:
         """Returns (r, 4) table rows of intervals of a level's length, from one value to another."""
@@ -93,11 +93,11 @@ class Isosurface(Lit):
             hides = hides | (a_little_below(low) >= level)
         return hides & ~self.is_hit[ray_index]
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         level = self.level
-        front, back = probe.value(piece.start), probe.value(piece.end)
+        front, back = probe.value(interval.start), probe.value(interval.end)
         below = front < level
-        hits_start = (self.last_end == piece.start) & ((self.last_value < level) != below)
+        hits_start = (self.last_end == interval.start) & ((self.last_value < level) != below)
         if self.filled != 0:
             hits_start = hits_start | (~below if self.filled > 0 else below)
         hits_start = mask & hits_start
@@ -105,11 +105,11 @@ class Isosurface(Lit):
         begins = hits_start & (self.last_end == -INF)
         crosses = mask & ~hits_start & (below != (back < level))
         self.last_value = torch.where(mask, back, self.last_value)
-        self.last_end = torch.where(mask, piece.end, self.last_end)
+        self.last_end = torch.where(mask, interval.end, self.last_end)
         self.last_end = torch.where(begins, INF, self.last_end)
         if not (hits_start | crosses).any():
             return
-        near, far, near_value, far_value = piece.start, piece.end, front, back
+        near, far, near_value, far_value = interval.start, interval.end, front, back
         for _ in range(_BISECTIONS):
             middle = near + (far - near) * 0.5
             value = probe.value(middle)
@@ -121,7 +121,9 @@ class Isosurface(Lit):
         hit = hits_start | crosses
         self.share = torch.where(hit, self.sum.clear, self.share)
         self.sum.clear = torch.where(hit, 0.0, self.sum.clear)
-        self.sum.depth = torch.where(hit, torch.where(hits_start, piece.start, t), self.sum.depth)
+        self.sum.depth = torch.where(
+            hit, torch.where(hits_start, interval.start, t), self.sum.depth
+        )
 
     def done(self, walk: Walk) -> None:
         """Shades the surface points found; each looks its node up once more."""
@@ -179,18 +181,18 @@ class Projection(Lit):
         )
         return no_gain & (self.length[ray_index] > 0)
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        kind, value = self.kind, probe.value(piece.middle)
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        kind, value = self.kind, probe.value(interval.middle)
         first = ~(self.length > 0)
         if kind == ProjectionKind.MEAN:
-            self.value_t = torch.where(mask & first, piece.start, self.value_t)
-            self.value = torch.where(mask, self.value + value * piece.length, self.value)
+            self.value_t = torch.where(mask & first, interval.start, self.value_t)
+            self.value = torch.where(mask, self.value + value * interval.length, self.value)
         else:
             better = value > self.value if kind == ProjectionKind.MAXIMUM else value < self.value
             better = mask & (first | better)
             self.value = torch.where(better, value, self.value)
-            self.value_t = torch.where(better, piece.middle, self.value_t)
-        self.length = torch.where(mask, self.length + piece.length, self.length)
+            self.value_t = torch.where(better, interval.middle, self.value_t)
+        self.length = torch.where(mask, self.length + interval.length, self.length)
 
     def done(self, walk: Walk) -> None:
         sampled = self.length > 0
@@ -209,13 +211,13 @@ class Features(Lit):
 
     feature_count = None
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        rgba = self.rgba(piece, probe)
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        rgba = self.rgba(interval, probe)
         share = torch.where(mask, self.sum.clear * rgba[:, 3], 0.0)
         assert self.other is not None  # `ops.trace.check_shade` requires it
-        numbers = probe.numbers(self.other, piece.middle)
+        numbers = probe.numbers(self.other, interval.middle)
         self.features = self.features + share[:, None] * numbers
-        self.sum.add(rgba, piece, mask)
+        self.sum.add(rgba, interval, mask)
 
 
 class GradientMagnitudeNumbers(NamedTuple):
@@ -227,13 +229,13 @@ class GradientMagnitudeNumbers(NamedTuple):
 class GradientMagnitude(Lit):
     """The transfer function, denser where the value changes faster."""
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         numbers = self.light.parameters.own_as(GradientMagnitudeNumbers)
-        rgba = self.rgba(piece, probe)
-        slope = probe.gradient(piece.middle, self.light.cube)
+        rgba = self.rgba(interval, probe)
+        slope = probe.gradient(interval.middle, self.light.cube)
         fraction = clamp(sqrt_exact(dot(slope, slope)) / numbers.full, 0, 1)
         alpha = torch.where(fraction > 0, stretch(rgba[:, 3], fraction), 0.0)
-        self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), piece, mask)
+        self.sum.add(torch.cat((rgba[:, :3], alpha[:, None]), 1), interval, mask)
 
 
 class ShaderKind(NamedTuple):

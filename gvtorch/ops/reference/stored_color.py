@@ -15,7 +15,7 @@ from ...base.constants import EMPTY
 from ..shading import COLOR_WIDTH, LIT_COLOR_WIDTH, Number
 from .exact import clamp, sqrt_exact, stretch, unit
 from .lit import Lit
-from .march import Piece, Probe, a_little_above
+from .march import Interval, Probe, a_little_above
 from .tree import ChannelBricks, Holder
 
 
@@ -49,27 +49,27 @@ class StoredColor(Lit):
     def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
         return ~(a_little_above(high) > 0)
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         numbers = self.numbers
-        color, opacity = self.seen(piece, probe, self.light.direction)
+        color, opacity = self.seen(interval, probe, self.light.direction)
         shown = mask & (opacity > 0)
         divisor = torch.where((numbers.premultiplied > 0) & shown, opacity, 1.0)
-        alpha = stretch(opacity, piece.length / numbers.reference)
+        alpha = stretch(opacity, interval.length / numbers.reference)
         rgba = torch.cat((color / divisor[:, None], alpha[:, None]), 1)
         if numbers.lit > 0:
-            self.lit(rgba, piece, probe, shown)
+            self.lit(rgba, interval, probe, shown)
         else:
-            self.sum.add(rgba, piece, shown)
+            self.sum.add(rgba, interval, shown)
 
-    def alpha(self, piece: Piece, probe: Probe, direction: Tensor) -> Tensor:
-        _, opacity = self.seen(piece, probe, direction)
-        return stretch(opacity, piece.length / self.numbers.reference)
+    def alpha(self, interval: Interval, probe: Probe, direction: Tensor) -> Tensor:
+        _, opacity = self.seen(interval, probe, direction)
+        return stretch(opacity, interval.length / self.numbers.reference)
 
-    def seen(self, piece: Piece, probe: Probe, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def seen(self, interval: Interval, probe: Probe, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Returns colours (r, 3) as stored, and opacities per reference length (r,), both scaled
         and as seen along rays `direction` (r, 3).
         """
-        stored = probe.numbers(self.channel, piece.middle)
+        stored = probe.numbers(self.channel, interval.middle)
         rgba = _by_direction(direction, stored, COLOR_WIDTH) * self.numbers.scale
         return rgba[:, :3], clamp(rgba[:, 3], 0, 1)
 
@@ -85,50 +85,52 @@ class Filtered(Lit):
 
     filtered = COLOR_WIDTH
 
-    def add(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         fine, coarse = probe.nodes.fine, probe.nodes.coarse
         has_colors = self.has_colors(fine) | self.has_colors(coarse)
-        self.add_by_function(piece, probe, mask & ~has_colors)
+        self.add_by_function(interval, probe, mask & ~has_colors)
         if not (mask & has_colors).any():
             return
-        contribution = probe.blend(piece.middle, partial(self.contribution, piece, probe))
-        self.add_contribution(contribution, piece, mask & has_colors)
+        contribution = probe.blend(interval.middle, partial(self.contribution, interval, probe))
+        self.add_contribution(contribution, interval, mask & has_colors)
 
-    def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
+    def add_by_function(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         """Adds an interval where no node has colours."""
-        self.sum.add(self.rgba(piece, probe), piece, mask)
+        self.sum.add(self.rgba(interval, probe), interval, mask)
 
-    def add_contribution(self, contribution: Tensor, piece: Piece, mask: Tensor) -> None:
+    def add_contribution(self, contribution: Tensor, interval: Interval, mask: Tensor) -> None:
         """Adds an interval, given the result of `contribution`."""
         self.sum.add_light(self.sum.clear[:, None] * contribution[:, :3], mask)
-        self.sum.absorb(contribution[:, 3], piece, mask)
+        self.sum.absorb(contribution[:, 3], interval, mask)
 
     def has_colors(self, holder: Holder) -> Tensor:
         """Returns (r,) bool: the node's brick has colours."""
         colored = 0 if self.other is None else len(self.other.bricks_bzyxc)
         return (holder.brick >= 0) & (holder.brick < colored)
 
-    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+    def contribution(self, interval: Interval, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 4) premultiplied colours and alphas of intervals, from one of the nodes."""
-        row = self.function_row(piece, holder)
+        row = self.function_row(interval, holder)
         row = torch.cat((row[:, :3] * row[:, 3:], row[:, 3:]), 1)
-        color, alpha, scale = self.seen_colors(self.stored_numbers(piece, holder), piece, holder)
+        color, alpha, scale = self.seen_colors(
+            self.stored_numbers(interval, holder), interval, holder
+        )
         colors = torch.cat((color[:, :3] * scale[:, None], alpha[:, None]), 1)
         colors = torch.where((scale > 0)[:, None], colors, 0.0)
         return torch.where(self.has_colors(holder)[:, None], colors, row)
 
-    def function_row(self, piece: Piece, holder: Holder) -> Tensor:
+    def function_row(self, interval: Interval, holder: Holder) -> Tensor:
         """Returns (r, 4) the transfer function's rows for one node's values."""
-        return self.transfer.interval(self.channel.sample(holder, piece.middle), piece)
+        return self.transfer.interval(self.channel.sample(holder, interval.middle), interval)
 
-    def stored_numbers(self, piece: Piece, holder: Holder) -> Tensor:
+    def stored_numbers(self, interval: Interval, holder: Holder) -> Tensor:
         """Returns (r, c) all numbers of a node's filtered colours; 0 where it has none."""
         assert self.other is not None  # else no node has colours
         brick = torch.where(self.has_colors(holder), holder.brick, EMPTY)
-        return self.other.samples(replace(holder, brick=brick), piece.middle)
+        return self.other.samples(replace(holder, brick=brick), interval.middle)
 
     def seen_colors(
-        self, stored: Tensor, piece: Piece, holder: Holder
+        self, stored: Tensor, interval: Interval, holder: Holder
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Returns colour and alpha (r, 4) of a node's voxels as rays see them; alphas (r,) of
         intervals; and their ratios to the voxels' alphas. `stored`: `stored_numbers`.
@@ -136,7 +138,7 @@ class Filtered(Lit):
         color = _by_direction(self.light.direction, stored, self.filtered)[:, :COLOR_WIDTH]
         stored_alpha = clamp(color[:, 3], 0, 1)
         side = self.light.parameters.own_as(FilteredNumbers).side
-        alpha = stretch(stored_alpha, piece.length * holder.scale / side)
+        alpha = stretch(stored_alpha, interval.length * holder.scale / side)
         scale = alpha / torch.where(stored_alpha > 0, stored_alpha, 1.0)
         return color, alpha, torch.where(stored_alpha > 0, scale, 0.0)
 
@@ -146,25 +148,25 @@ class FilteredLit(Filtered):
 
     filtered = LIT_COLOR_WIDTH
 
-    def add_by_function(self, piece: Piece, probe: Probe, mask: Tensor) -> None:
-        self.lit(self.rgba(piece, probe), piece, probe, mask)
+    def add_by_function(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
+        self.lit(self.rgba(interval, probe), interval, probe, mask)
 
-    def add_contribution(self, contribution: Tensor, piece: Piece, mask: Tensor) -> None:
+    def add_contribution(self, contribution: Tensor, interval: Interval, mask: Tensor) -> None:
         shown = mask & (contribution[:, 3] > 0)
         self.add_normal(self.sum.clear[:, None] * contribution[:, 4:], shown)
-        super().add_contribution(contribution, piece, mask)
+        super().add_contribution(contribution, interval, mask)
 
-    def contribution(self, piece: Piece, probe: Probe, holder: Holder) -> Tensor:
+    def contribution(self, interval: Interval, probe: Probe, holder: Holder) -> Tensor:
         """Returns (r, 7): the result of `Filtered.contribution`, lit, and normals times alpha."""
-        t, light = piece.middle, self.light
-        row = self.function_row(piece, holder)
+        t, light = interval.middle, self.light
+        row = self.function_row(interval, holder)
         normal = light.to_eye(probe.slope(holder, t, light.cube))
         color, alpha = light.shade(row[:, :3], normal, t), row[:, 3:]
         by_function = torch.cat((color * alpha, alpha, normal * alpha), 1)
         by_function = torch.where(alpha > 0, by_function, 0.0)
 
-        stored = self.stored_numbers(piece, holder)
-        color_alpha, interval_alpha, scale = self.seen_colors(stored, piece, holder)
+        stored = self.stored_numbers(interval, holder)
+        color_alpha, interval_alpha, scale = self.seen_colors(stored, interval, holder)
         shown, alpha = (scale > 0)[:, None], interval_alpha[:, None]
         stored_alpha = torch.where(scale > 0, clamp(color_alpha[:, 3], 0, 1), 1.0)[:, None]
         moments, front = self.moments(stored)

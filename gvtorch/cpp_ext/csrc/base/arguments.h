@@ -95,7 +95,7 @@ using Bool = NumberOf<bool>;
   X(Voxels, bricks_bzyxc, kAny)       \
   X(Voxels, constant_tnc, args.nodes* args.voxel_width)
 
-// Node pool, transfer function, and where rays end. The limits use tiles, rows
+// Node pool, transfer function, and where rays end. In scope for the limits: tiles, rows
 #define GV_WALK(X)                                         \
   X(Voxels, range_tn2c, 2 * args.nodes * args.voxel_width) \
   X(Int, component, args.voxel_width)                      \

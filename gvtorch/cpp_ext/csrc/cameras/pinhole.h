@@ -6,7 +6,7 @@
 
 namespace gvtorch::GV_NAMESPACE {
 
-// Rows are counted through the batch: `rows` from `first`, `height` per camera. The limits use cameras
+// Rows are counted through the batch: `rows` from `first`, `height` per camera. In scope for the limits: cameras
 #define GV_PINHOLE_RAYS(X)                   \
   X(World, camera_nc, cameras* args.columns) \
   X(Int, first, kAny)                        \

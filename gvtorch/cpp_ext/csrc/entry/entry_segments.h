@@ -116,7 +116,7 @@ inline auto run(const SampleBricksBackwardOp& a) {
     grad_bzyxc = make_zeros(args.grad_bzyxc, a.grad_kc, {a.bricks_bzyxc.size(0), side, side, side, voxel_width});
     grad_tnc = make_zeros(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), voxel_width});
     const Tensor row_xn = make_zeros(args.row_xn, a.grad_kc, {args.rows, find.numbers()});
-    for_each(a.origin_r3, args.pieces * args.kThreads, args);
+    for_each(a.origin_r3, args.portions * args.kThreads, args);
     for_each(a.origin_r3, args.rows * find.numbers(), AddRows<decltype(real)>{args});
   });
   return std::make_tuple(grad_bzyxc, grad_tnc);

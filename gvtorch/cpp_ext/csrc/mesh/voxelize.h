@@ -20,7 +20,7 @@ constexpr double kParts = 1 << 30;  // of a voxel: volumes are summed as whole p
 constexpr int32_t kCorners = 16;    // of a clipped triangle, at most
 constexpr double kCoarse = 2;       // voxel size, in triangle sizes (`detail`), above which voxels descend alone
 
-// The limits use boxes
+// In scope for the limits: boxes
 #define GV_VOXELIZE(X)                     \
   X(World, corner_f33, 9 * args.triangles) \
   X(Flags, solid_f, args.triangles)        \

@@ -11,7 +11,8 @@ namespace gvtorch {
 
 enum class NoiseKind : int32_t { kPerlin, kValue, kSimplex, kNearest, kSecond, kApart, kCount };
 
-// The limits use points. Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise.
+// Salts are 32 bits; a period of 0 means none; jitter and reach are for cellular noise. In scope for the limits:
+// points
 #define GV_NOISE(X)                     \
   X(Reals, point_pn, args.axes* points) \
   X(Int, kind, kNoiseKinds)             \

@@ -260,50 +260,50 @@ struct PacketWalk : PacketPath {
 
   // Adds a region of one value as one interval.
   GV_HD void add_region(Mask mask) {
-    Piece<Floats> piece;
-    piece.start = intervals.start;
+    Interval<Floats> interval;
+    interval.start = intervals.start;
     leave(mask);
-    piece.end = smaller(intervals.start, intervals.stop);
-    piece.set_odd();
-    piece.value = piece.front = piece.back = fine.constant;
+    interval.end = smaller(intervals.start, intervals.stop);
+    interval.set_odd();
+    interval.value = interval.front = interval.back = fine.constant;
     samples = samples - mask;
     marching = mask;
-    add(mask, piece);
+    add(mask, interval);
   }
 
   // Takes one interval in all lanes that march; returns those whose run goes on. So that the next sample never waits
   // for this one's colour, a lane whose ray has ended marches on without effect to the end of its run.
   GV_HD Mask march(Mask mask) {
     marching = mask;
-    Piece<Floats> piece;
-    piece.middle = intervals.middle_of(number);
-    piece.start = intervals.start_of(number);
-    piece.end = intervals.start_of(number + 1.0f);
-    piece.length = intervals.length;
-    piece.level = intervals.level;
+    Interval<Floats> interval;
+    interval.middle = intervals.middle_of(number);
+    interval.start = intervals.start_of(number);
+    interval.end = intervals.start_of(number + 1.0f);
+    interval.length = intervals.length;
+    interval.level = intervals.level;
     number = number - to_floats(mask);
     remaining = remaining + mask;
     if constexpr (kEnds) {
-      piece.front = last_value;
-      piece.back = last_value = value(piece.end);
+      interval.front = last_value;
+      interval.back = last_value = value(interval.end);
     } else if constexpr (!Shader::kReadsAll) {
-      piece.value = value(piece.middle);
+      interval.value = value(interval.middle);
     }
     const Mask seeing = mask & (sum.clear > stop_clear);
     samples = samples - seeing;
-    add(seeing, piece);
+    add(seeing, interval);
     return mask & (remaining > 0);
   }
 
-  GV_HD void add(Mask mask, const Piece<Floats>& piece) {
+  GV_HD void add(Mask mask, const Interval<Floats>& interval) {
     if constexpr (kShadowed) {
       const auto add_lit = [&](Mask shown, const LitPoint<Floats>& point, const LightCone<Floats>& cone) {
         shadows.put(shown, point, cone, *this);
-        sum.absorb(point.base.alpha, piece, shown);
+        sum.absorb(point.base.alpha, interval, shown);
       };
-      shader.add(mask, piece, *this, sum, add_lit);
+      shader.add(mask, interval, *this, sum, add_lit);
     } else {
-      shader.add(mask, piece, *this, sum);
+      shader.add(mask, interval, *this, sum);
     }
   }
 
@@ -312,8 +312,8 @@ struct PacketWalk : PacketPath {
       auto lane_intervals = take_lane<Intervals<float>>(intervals, lane);
       const Extent<float> lane_extent{extent.exit[lane], extent.cone_low[lane], extent.cone_high[lane]};
       auto&& lane_sum = sum_of<Sum>(sum, lane);
-      const auto add_lit = [&](const Piece<float>& piece, const LitPoint<float>& point, const LightCone<float>& cone,
-                               int32_t&) {
+      const auto add_lit = [&](const Interval<float>& interval, const LitPoint<float>& point,
+                               const LightCone<float>& cone, int32_t&) {
         if constexpr (kShadowed) {
           if (shadows.is_full()) {  // adding changes this lane's sum too
             put_lane(sum, lane, lane_sum);
@@ -321,7 +321,7 @@ struct PacketWalk : PacketPath {
             lane_sum = sum_of<Sum>(sum, lane);
           }
           shadows.put(lane, point, cone, lane_sum.clear * point.base.alpha);
-          lane_sum.absorb(point.base.alpha, piece);
+          lane_sum.absorb(point.base.alpha, interval);
         }
       };
       typename Kernel::template Visitor<Shader, std::decay_t<decltype(add_lit)>> visitor{kernel,   shader,     nullptr,

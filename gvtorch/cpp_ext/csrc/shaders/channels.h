@@ -76,15 +76,15 @@ struct ChannelMix : ShaderFacts {
     return hides;
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum) const {
     probe.select_lanes(mask);
     V values[kMaxNumbers];
-    probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), piece.middle,
+    probe.numbers_at(probe.channels.value, Components<T>{&view.table_lm[1].red, 4, width}, count(), interval.middle,
                      values);
     V red{}, green{}, blue{}, total{};
     const bool additive = view.table_lm[0].green > 0;
     each_channel([&](int32_t i, const ChannelRows<T>& rows) {
-      const Row<V> row = rows.look_up(values[i], piece.level, mask, view.rows);  // its alpha holds halvings
+      const Row<V> row = rows.look_up(values[i], interval.level, mask, view.rows);  // its alpha holds halvings
       red = red + row.alpha * row.red;
       green = green + row.alpha * row.green;
       blue = blue + row.alpha * row.blue;
@@ -93,9 +93,9 @@ struct ChannelMix : ShaderFacts {
     const MaskOf<V> shown = mask && total > 0;
     if (!any(shown)) return;
     V halvings = total;
-    if (piece.odd) halvings = total * (piece.length / step);
+    if (interval.odd) halvings = total * (interval.length / step);
     const V alpha = absorbed_by(halvings), scale = alpha / total;
-    sum.add_premultiplied({red * scale, green * scale, blue * scale, alpha}, piece, shown);
+    sum.add_premultiplied({red * scale, green * scale, blue * scale, alpha}, interval, shown);
   }
 
  private:

@@ -45,11 +45,11 @@ struct Labels : ShaderFacts {
     return table.opaque_m[last] == (first > 0 ? table.opaque_m[first - 1] : 0);
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum) const {
     Row<V> row{};
     Vec3<V> normal{};
     probe.each_lane(mask, [&](int lane, const auto& lane_probe) {
-      const Contribution contribution = blended(take_lane<Piece<T>>(piece, lane), lane_probe);
+      const Contribution contribution = blended(take_lane<Interval<T>>(interval, lane), lane_probe);
       const T clear = lane_of(sum.clear, lane), clear_after = clear * (1 - contribution.row.alpha);
       if (clear_after < sum.hit_clear && clear >= sum.hit_clear) {
         lane_of(sum.feature_c, lane)[0] = static_cast<T>(1 + contribution.label);
@@ -60,7 +60,7 @@ struct Labels : ShaderFacts {
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
     sum.add_normal(normal, sum.clear, shown);
-    sum.add_premultiplied(row, piece, shown);
+    sum.add_premultiplied(row, interval, shown);
   }
 
  private:
@@ -68,24 +68,24 @@ struct Labels : ShaderFacts {
     return static_cast<int32_t>(clamp(label - table.low, static_cast<T>(0), table.last));
   }
   // Blends both nodes; the label is the finer node's, or the coarser one's where the finer node shows nothing.
-  GV_HD Contribution blended(const Piece<T>& piece, const Probe<T>& probe) const {
+  GV_HD Contribution blended(const Interval<T>& interval, const Probe<T>& probe) const {
     Contribution result;
     GV_NO_UNROLL
     for (int node = 0; node <= static_cast<int>(probe.mixed); ++node) {
-      const Contribution contribution = contribution_of(piece, probe, node == 0 ? probe.fine : probe.coarse);
+      const Contribution contribution = contribution_of(interval, probe, node == 0 ? probe.fine : probe.coarse);
       if (node == 0) {
         result = contribution;
         continue;
       }
       if (!(result.row.alpha > 0)) result.label = contribution.label;
-      result.row = probe.between(result.row, contribution.row, piece.middle);
-      result.normal = probe.between(result.normal, contribution.normal, piece.middle);
+      result.row = probe.between(result.row, contribution.row, interval.middle);
+      result.normal = probe.between(result.normal, contribution.normal, interval.middle);
     }
     return result;
   }
-  GV_HD Contribution contribution_of(const Piece<T>& piece, const Probe<T>& probe, const Spot<T>& spot) const {
+  GV_HD Contribution contribution_of(const Interval<T>& interval, const Probe<T>& probe, const Spot<T>& spot) const {
     const Transfer<T> table(transfer);
-    const T t = piece.middle;
+    const T t = interval.middle;
     Contribution result;
     int32_t cell[3] = {0, 0, 0};
     T from_center[3] = {0, 0, 0}, label;
@@ -96,9 +96,9 @@ struct Labels : ShaderFacts {
       label = probe.value_in(spot, cell[0], cell[1], cell[2]);
     }
     result.label = row_of(table, label);
-    Row<T> row = load_row(&table.table_lm[(piece.odd ? 0 : piece.level) * table.rows + result.label]);
+    Row<T> row = load_row(&table.table_lm[(interval.odd ? 0 : interval.level) * table.rows + result.label]);
     if (!(row.alpha > 0)) return result;
-    if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
+    if (interval.odd) row.alpha = stretch(row.alpha, interval.length / step);
     if (own_numbers<Numbers>(light.parameters).lit > 0) {
       if (spot.brick >= 0) result.normal = normal(probe, spot, cell, from_center, label);
       row = light.shade(row, result.normal, probe, t);

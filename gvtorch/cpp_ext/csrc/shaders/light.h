@@ -158,16 +158,16 @@ struct Light {
   }
   // Adds an interval, lit; with shadows, `shadow(mask, point, cone)` adds it, by `in_shadow`.
   template <class V, class AnyProbe, class... Shadow>
-  GV_HD void add(MaskOf<V> mask, const Row<V>& base, const AnyProbe& probe, const Piece<V>& piece, ShadeSum<V>& sum,
-                 const Shadow&... shadow) const {
-    const Vec3<V> n = normal(probe, piece.middle);
-    const LightCone<V> cone = towards(probe, piece.middle);
+  GV_HD void add(MaskOf<V> mask, const Row<V>& base, const AnyProbe& probe, const Interval<V>& interval,
+                 ShadeSum<V>& sum, const Shadow&... shadow) const {
+    const Vec3<V> n = normal(probe, interval.middle);
+    const LightCone<V> cone = towards(probe, interval.middle);
     const LitPoint<V> point = point_of(base, n, probe.sight.direction, cone.direction);
     sum.add_normal(n, sum.clear * base.alpha, mask);
     if constexpr (sizeof...(shadow) > 0) {
       (shadow(mask, point, cone), ...);
     } else {
-      sum.add(lit(base, point.facing, point.highlight), piece, mask);
+      sum.add(lit(base, point.facing, point.highlight), interval, mask);
     }
   }
   // Lights a base colour by the factors of its diffuse (`facing`) and specular (`highlight`) light.

@@ -10,10 +10,10 @@ namespace gvtorch::GV_NAMESPACE {
 
 // The transfer function's colour of a value, and its alpha over an interval of any length.
 template <class T, class V>
-GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Piece<V>& piece, T step,
+GV_HD Row<V> look_up(const Transfer<T>& transfer, V value, const Interval<V>& interval, T step,
                      MaskOf<V> mask = all_lanes<V>()) {
-  Row<V> row = transfer.look_up(value, piece.level, mask);
-  if (piece.odd) row.alpha = stretch(row.alpha, piece.length / step);
+  Row<V> row = transfer.look_up(value, interval.level, mask);
+  if (interval.odd) row.alpha = stretch(row.alpha, interval.length / step);
   return row;
 }
 
@@ -60,9 +60,9 @@ struct Plain : ShaderFacts {
     return Transfer<T>(transfer).transparent(low, high);
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, ShadeSum<V>& sum) const {
-    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
-    if (!all_transparent(mask, row.alpha)) sum.add(row, piece, mask);
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe&, ShadeSum<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(transfer), interval.value, interval, step, mask);
+    if (!all_transparent(mask, row.alpha)) sum.add(row, interval, mask);
   }
 };
 

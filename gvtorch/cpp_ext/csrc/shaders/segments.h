@@ -13,14 +13,14 @@
 
 namespace gvtorch {
 
-// A part of a walk: it continues from state_r3, and pauses after `limit` samples. The limits use rays
+// A part of a walk: it continues from state_r3, and pauses after `limit` samples. In scope for the limits: rays
 #define GV_PART(X)                  \
   X(MaybeReals, state_r3, 3 * rays) \
   X(Int, limit, kAny)               \
   X(Bool, by_node, kAny)
 #define GV_SEGMENT_RANGE(X) X(Longs, first_r, rays) X(Count, total, kAny)
 
-// Segments, and samples of them. The limits use samples
+// Segments, and samples of them. In scope for the limits: samples
 #define GV_SAMPLES(X)                      \
   X(Words, ray_s, args.segments)           \
   X(Words, node_s2, 2 * args.segments)     \
@@ -36,11 +36,11 @@ namespace gvtorch {
   X(Longs, entry_e, args.entries)              \
   X(Words, segment_e, args.entries)            \
   X(Words, length_e, args.entries)             \
-  X(Longs, begin_p, args.pieces + 1)           \
-  X(Longs, row_p, args.pieces)                 \
+  X(Longs, begin_p, args.portions + 1)         \
+  X(Longs, row_p, args.portions)               \
   X(Longs, added_x, args.rows)
 
-// Packed samples of rays: those of a ray are consecutive, from front to back. The limits use rays
+// Packed samples of rays: those of a ray are consecutive, from front to back. In scope for the limits: rays
 #define GV_PACKED(X)                           \
   X(Reals, alpha_k, args.count)                \
   X(Reals, feature_kc, args.count* args.width) \
@@ -328,32 +328,31 @@ struct SampleBricks {
 };
 
 // The gradient of SampleBricks: each sample adds to the voxels (or constants) it was made of, and those of a brick are
-// added one after another, in the order of the samples, whatever runs beside. (Atomic sums would have other bits in
-// each run; they took longer, too.)
+// added one after another, in the order of the samples, so that sums have the same bits in every run.
 //
 // An entry is a run of samples of one segment, and one of its two nodes. Entries are sorted by the brick (or constants)
-// they add to, and cut into pieces, each of which belongs to one brick. A brick's first piece adds to the gradient, its
-// others to rows of their own, which AddRows adds up.
+// they add to, and cut into portions, each of which belongs to one brick. A brick's first portion adds to the gradient,
+// its others to rows of their own, which AddRows adds up.
 //
 //   entry_e     twice the first sample of each entry, and one more for the coarse node
 //   segment_e   its segment
 //   length_e    its number of samples
-//   begin_p     each piece's first entry, and the end of the last one
-//   row_p       the row that a piece adds to; -1: the gradient
-//   added_x     the pieces that have rows, in order
+//   begin_p     each portion's first entry, and the end of the last one
+//   row_p       the row that a portion adds to; -1: the gradient
+//   added_x     the portions that have rows, in order
 //
-// On a GPU a piece has eight threads: each adds to those voxels whose three coordinates are odd or even as its number
+// On a GPU a portion has eight threads: each adds to those voxels whose three coordinates are odd or even as its number
 // says. A sample has one voxel for each of them.
 template <class T>
 struct SpreadGradient {
 #ifdef __CUDACC__
-  static constexpr int kThreads = 8;  // of a piece
+  static constexpr int kThreads = 8;  // of a portion
 #else
   static constexpr int kThreads = 1;
   static constexpr int64_t kChunkSize = 4;  // see for_each.h
 #endif
   FindSamples<T> find;
-  int64_t samples, entries, pieces, rows;
+  int64_t samples, entries, portions, rows;
   GV_GRADIENT(GV_TYPED_VIEW)
   T *grad_bzyxc = nullptr, *grad_tnc = nullptr, *row_xn = nullptr;
 
@@ -380,8 +379,8 @@ struct SpreadGradient {
   }
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t piece = index / kThreads, row = row_p[piece];
-    for (int64_t e = begin_p[piece]; e < smaller(begin_p[piece + 1], entries); ++e) {
+    const int64_t portion = index / kThreads, row = row_p[portion];
+    for (int64_t e = begin_p[portion]; e < smaller(begin_p[portion + 1], entries); ++e) {
       const Entry found = entry(e);
       const Spot<T>& spot = found.source.first;
       T* sum = row >= 0 && row < rows ? row_xn + row * find.numbers() : gradient(spot);
@@ -424,9 +423,9 @@ struct AddRows {
   GV_HD void operator()(int64_t index) const {
     const int64_t numbers = spread.find.numbers(), number = index % numbers;
     int64_t row = index / numbers;
-    const int64_t piece = spread.added_x[row];
-    if (piece < 0 || piece >= spread.pieces || (row > 0 && spread.added_x[row - 1] == piece - 1)) return;
-    const auto found = spread.entry(spread.begin_p[piece]);
+    const int64_t portion = spread.added_x[row];
+    if (portion < 0 || portion >= spread.portions || (row > 0 && spread.added_x[row - 1] == portion - 1)) return;
+    const auto found = spread.entry(spread.begin_p[portion]);
     if (found.first >= found.end || (found.source.first.brick < 0 && number >= spread.find.width)) return;
     T* sum = spread.gradient(found.source.first) + number;
     T total = *sum;

@@ -75,8 +75,8 @@ struct ShadeRay : Walk<T> {
     int32_t samples;
     if constexpr (kShadows) {
       Shadows<T, ShadeRay> shadows{*this, ray, sight, threads};
-      samples = trace_ray([&](const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone,
-                              int32_t& ray_samples) { shadows.add(piece, point, cone, sum, ray_samples); });
+      samples = trace_ray([&](const Interval<T>& interval, const LitPoint<T>& point, const LightCone<T>& cone,
+                              int32_t& ray_samples) { shadows.add(interval, point, cone, sum, ray_samples); });
       shadows.finish(sum, samples);
     } else {
       samples = trace_ray(nullptr);
@@ -187,7 +187,7 @@ struct ShadeRay : Walk<T> {
     return sum.clear;
   }
 
-  // See Walk::follow. AnyShader: as above. AddLit: adds an interval with its shadow, add_lit(piece, point, cone,
+  // See Walk::follow. AnyShader: as above. AddLit: adds an interval with its shadow, add_lit(interval, point, cone,
   // samples); called only with kShadows.
   template <class AnyShader, class AddLit = std::nullptr_t>
   struct Visitor {
@@ -220,15 +220,15 @@ struct ShadeRay : Walk<T> {
       return probe.uniform() && !kernel.template shades_each_position<AnyShader>();
     }
     GV_HD void region(const RayProbe& probe, T start, T end) {
-      Piece<T> piece;
-      piece.start = start;
-      piece.end = end;
-      piece.set_odd();
-      piece.value = piece.front = piece.back = probe.value(piece.middle);
+      Interval<T> interval;
+      interval.start = start;
+      interval.end = end;
+      interval.set_odd();
+      interval.value = interval.front = interval.back = probe.value(interval.middle);
       if constexpr (AnyShader::kFiltered > 0) {
-        shader.plain().add(true, piece, probe, sum);  // it has no brick, so no filtered colours
+        shader.plain().add(true, interval, probe, sum);  // it has no brick, so no filtered colours
       } else {
-        shader.add(true, piece, probe, sum);
+        shader.add(true, interval, probe, sum);
       }
       ++samples;
     }
@@ -261,27 +261,27 @@ struct ShadeRay : Walk<T> {
     template <class ActiveShader, class Value>
     GV_HD int32_t take_with(const ActiveShader& active_shader, const Value& value, const RayProbe& probe,
                             const Intervals<T>& intervals, int32_t run_length, bool last) {
-      Piece<T> piece;
+      Interval<T> interval;
       T number = intervals.count;
       const T end = number + static_cast<T>(run_length);
-      if (kEnds) piece.back = value(intervals.start);
+      if (kEnds) interval.back = value(intervals.start);
       do {
-        piece.start = intervals.start_of(number);
-        piece.end = last ? intervals.stop : intervals.start_of(number + 1);
+        interval.start = intervals.start_of(number);
+        interval.end = last ? intervals.stop : intervals.start_of(number + 1);
         if (last) {
-          piece.set_odd();
+          interval.set_odd();
         } else {
-          piece.level = intervals.level;
-          piece.length = intervals.length;
-          piece.middle = intervals.middle_of(number);
+          interval.level = intervals.level;
+          interval.length = intervals.length;
+          interval.middle = intervals.middle_of(number);
         }
         if (kEnds) {
-          piece.front = piece.back;
-          piece.back = value(piece.end);
+          interval.front = interval.back;
+          interval.back = value(interval.end);
         } else {
-          piece.value = value(piece.middle);
+          interval.value = value(interval.middle);
         }
-        add(active_shader, piece, probe);
+        add(active_shader, interval, probe);
         number = number + 1;
       } while (number < end && sees());
       const int32_t taken = static_cast<int32_t>(number - intervals.count);
@@ -289,13 +289,13 @@ struct ShadeRay : Walk<T> {
       return taken;
     }
     template <class ActiveShader>
-    GV_HD void add(const ActiveShader& active_shader, const Piece<T>& piece, const RayProbe& probe) {
+    GV_HD void add(const ActiveShader& active_shader, const Interval<T>& interval, const RayProbe& probe) {
       if constexpr (kShadows && !kToLight) {
-        active_shader.add(true, piece, probe, sum, [&](bool, const LitPoint<T>& point, const LightCone<T>& cone) {
-          add_lit(piece, point, cone, samples);
+        active_shader.add(true, interval, probe, sum, [&](bool, const LitPoint<T>& point, const LightCone<T>& cone) {
+          add_lit(interval, point, cone, samples);
         });
       } else {
-        active_shader.add(true, piece, probe, sum);
+        active_shader.add(true, interval, probe, sum);
       }
     }
   };

@@ -4,29 +4,29 @@
 // A shader is a small struct, copied into the kernel:
 //
 //   explicit Shader(const ShadeArgs&)             on the host: borrows tables and parameters
-//   kEnds                                         pieces have the values at an interval's two ends, else in its middle
+//   kEnds                                         intervals have values at their two ends, else in their middle
 //   kSeesEmpty                                    EMPTY nodes are shaded too, with their mean value
 //   SumOf<V> : ShadeSum<V>, Sum = SumOf<T>        the state of a ray; `clear` at 1 - stop_alpha ends the ray
 //   hides(low, high, sum)                         true if no value in [low, high] changes the sum: the node is skipped.
 //                                                 Without kHidesAlike, it is written for V, like `add`
 //   kHidesAlike                                   `hides` ignores the sum: nodes are hidden from all rays alike
-//   kReadsAll, hides_ranges(range_of)             `add` reads all numbers through its probe, and pieces have no value.
+//   kReadsAll, hides_ranges(range_of)             `add` reads all numbers through its probe; intervals have no value.
 //                                                 hides_ranges then replaces `hides`: range_of(component) returns the
 //                                                 smallest and largest value (low, high) that one of a voxel's numbers
 //                                                 has in the node
-//   add(mask, piece, probe, sum)                  adds an interval; `probe` reads any channel at any distance
+//   add(mask, interval, probe, sum)               adds an interval; `probe` reads any channel at any distance
 //   kSurface, surface(probe, sum)                 called where depth was set, with a probe of the node found there
 //   done(sum)                                     called after the last interval
 //
 // A shader that receives shadows also has
 //
-//   alpha(mask, piece, probe)                     share that an interval absorbs of the light from behind
-//   add(mask, piece, probe, sum, shadow...)       `shadow`: see Light::add
+//   alpha(mask, interval, probe)                  share that an interval absorbs of the light from behind
+//   add(mask, interval, probe, sum, shadow...)    `shadow`: see Light::add
 //
 // T is float or double. `add` is written once for a ray (V is T) and for a packet (V is Floats, see arithmetic.h), in
-// which each lane of `mask` adds an interval; piece, probe and sum are of V. `probe.select_lanes(mask)` limits what is
-// read from then on to fewer lanes, `probe.each_lane(mask, body)` passes each lane's own probe. `alpha` is written once
-// as well. Everything else is called for one ray.
+// which each lane of `mask` adds an interval; interval, probe and sum are of V. `probe.select_lanes(mask)` limits what
+// is read from then on to fewer lanes, `probe.each_lane(mask, body)` passes each lane's own probe. `alpha` is written
+// once as well. Everything else is called for one ray.
 //
 // An interval belongs to the node that contains its middle. Its ends may lie up to half an interval outside; they are
 // still read in this node, clamped to its brick's outermost voxel centres. With a border of 1 and steps of at most a
@@ -56,17 +56,17 @@ struct Lit : Plain<T> {
   explicit Lit(const ShadeArgs& args) : Plain<T>(args), light(args) {}
 
   template <class V, class AnyProbe>
-  GV_HD V alpha(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe&) const {
-    return look_up(Transfer<T>(transfer), piece.value, piece, step, mask).alpha;
+  GV_HD V alpha(MaskOf<V> mask, const Interval<V>& interval, const AnyProbe&) const {
+    return look_up(Transfer<T>(transfer), interval.value, interval, step, mask).alpha;
   }
   template <class V, class AnyProbe, class... Shadow>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
-    const Row<V> row = look_up(Transfer<T>(transfer), piece.value, piece, step, mask);
+    const Row<V> row = look_up(Transfer<T>(transfer), interval.value, interval, step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
     probe.select_lanes(shown);
-    light.add(shown, row, probe, piece, sum, shadow...);
+    light.add(shown, row, probe, interval, sum, shadow...);
   }
 };
 
@@ -90,25 +90,26 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
   using FromAfar<T, Lit<T>, FilteredLit<T>>::FromAfar;
 
   template <class V>
-  GV_HD void add_contribution(MaskOf<V> mask, const LitRow<V>& lit_row, const Piece<V>& piece, ShadeSum<V>& sum) const {
+  GV_HD void add_contribution(MaskOf<V> mask, const LitRow<V>& lit_row, const Interval<V>& interval,
+                              ShadeSum<V>& sum) const {
     sum.add_normal(lit_row.normal, sum.clear, mask && lit_row.row.alpha > 0);
-    sum.add_premultiplied(lit_row.row, piece, mask);
+    sum.add_premultiplied(lit_row.row, interval, mask);
   }
   // What one of the nodes adds; 0 in other lanes.
   template <class V, class AnyProbe, class Node>
-  GV_HD LitRow<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
+  GV_HD LitRow<V> contribution(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, const Node& node) const {
     const MaskOf<V> colored = mask && node.in_first_slots(this->bricks), uncolored = mask && !colored;
     LitRow<V> lit_row;
-    if (any(uncolored)) lit_row = by_function(uncolored, piece, probe, node);
+    if (any(uncolored)) lit_row = by_function(uncolored, interval, probe, node);
     if (!any(colored)) return lit_row;
-    return choose(colored, by_colors(colored, piece, probe, node), lit_row);
+    return choose(colored, by_colors(colored, interval, probe, node), lit_row);
   }
 
  private:
   template <class V, class AnyProbe, class Node>
-  GV_HD LitRow<V> by_function(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
-    const V t = piece.middle;
-    const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, mask);
+  GV_HD LitRow<V> by_function(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, const Node& node) const {
+    const V t = interval.middle;
+    const Row<V> row = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), interval, this->step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return {};
     probe.select_lanes(shown);
@@ -116,16 +117,16 @@ struct FilteredLit : FromAfar<T, Lit<T>, FilteredLit<T>> {
     return times_alpha(shown, this->light.shade(row, n, probe, t), n);
   }
   template <class V, class AnyProbe, class Node>
-  GV_HD LitRow<V> by_colors(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
-    const V t = piece.middle;
+  GV_HD LitRow<V> by_colors(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, const Node& node) const {
+    const V t = interval.middle;
     probe.select_lanes(mask);
     const auto& colors = probe.channels.other;
     const Vec3<V> d = probe.sight.direction;
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
     const Row<V> color = by_direction(mask, d, colors.width, read, kFiltered);
     const V stored_alpha = saturate(color.alpha);
-    const V alpha =
-        stretch(stored_alpha, piece.length * probe.scale_of(node) / own_numbers<Numbers>(this->light.parameters).side);
+    const V alpha = stretch(stored_alpha,
+                            interval.length * probe.scale_of(node) / own_numbers<Numbers>(this->light.parameters).side);
     const MaskOf<V> shown = mask && stored_alpha > 0 && alpha / stored_alpha > 0;
     if (!any(shown)) return {};
     const bool sided = colors.width != kFiltered;
@@ -191,8 +192,8 @@ struct ShadowShader : ShaderFacts {
   const Shader& shader;
 
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe, SumOf<V>& sum) const {
-    sum.clear = select(mask, sum.clear * (1 - shader.alpha(mask, piece, probe)), sum.clear);
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, const AnyProbe& probe, SumOf<V>& sum) const {
+    sum.clear = select(mask, sum.clear * (1 - shader.alpha(mask, interval, probe)), sum.clear);
   }
 };
 
@@ -209,26 +210,26 @@ struct PreIntegrated : ShaderFacts {
 
   GV_HD bool hides(T low, T high, const Sum&) const { return Transfer<T>(transfer).transparent(low, high); }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, ShadeSum<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe&, ShadeSum<V>& sum) const {
     const Transfer<T> table(transfer);
     V lengths = broadcast<V>(static_cast<T>(1));
-    if (piece.odd) lengths = piece.length / step;
-    const auto pair = [&](V from, V to) { return between(table, from, to, piece.level, mask); };
-    const V front = clamp(piece.front, table.low, table.high);
-    const V back = clamp(piece.back, table.low, table.high);
-    const MaskOf<V> outside = mask && !(front == back || (front == piece.front && back == piece.back));
+    if (interval.odd) lengths = interval.length / step;
+    const auto pair = [&](V from, V to) { return between(table, from, to, interval.level, mask); };
+    const V front = clamp(interval.front, table.low, table.high);
+    const V back = clamp(interval.back, table.low, table.high);
+    const MaskOf<V> outside = mask && !(front == back || (front == interval.front && back == interval.back));
     Row<V> row = pair(front, back);
     if (!any(outside)) {
       row = with_length(row, lengths);
     } else {
-      const V rate = lengths / absolute(piece.back - piece.front);
-      const Row<V> before = with_length(pair(front, front), rate * absolute(front - piece.front));
-      const Row<V> behind = with_length(pair(back, back), rate * absolute(piece.back - back));
+      const V rate = lengths / absolute(interval.back - interval.front);
+      const Row<V> before = with_length(pair(front, front), rate * absolute(front - interval.front));
+      const Row<V> behind = with_length(pair(back, back), rate * absolute(interval.back - back));
       const Row<V> parts = over(over(before, with_length(row, rate * absolute(back - front))), behind);
       row = choose(outside, parts, with_length(row, lengths));
     }
     if (all_transparent(mask, row.alpha)) return;
-    sum.add_premultiplied(row, piece, mask);
+    sum.add_premultiplied(row, interval, mask);
   }
   // The row of an interval from one value to another, of a length that the table has.
   template <class V>
@@ -292,18 +293,18 @@ struct Isosurface : ShaderFacts {
     return (!(filled < 0) && a_little_above(high) < level) || (!(filled > 0) && a_little_below(low) >= level);
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, SumOf<V>& sum) const {
     using Mask = MaskOf<V>;
     const T level = numbers().level, filled = numbers().filled;
-    const Mask below = piece.front < level;
-    const Mask jumped = sum.last_end == piece.start && (sum.last_value < level) != below;
+    const Mask below = interval.front < level;
+    const Mask jumped = sum.last_end == interval.start && (sum.last_value < level) != below;
     const Mask solid = filled == 0 ? Mask{} : filled > 0 ? !below : below;
     const Mask hits_start = mask && (jumped || solid);
-    const Mask crosses = mask && !hits_start && below != (piece.back < level);
-    V hit_t = piece.start;
+    const Mask crosses = mask && !hits_start && below != (interval.back < level);
+    V hit_t = interval.start;
     if (any(crosses)) {
       probe.select_lanes(crosses);
-      V near = piece.start, far = piece.end, near_value = piece.front, far_value = piece.back;
+      V near = interval.start, far = interval.end, near_value = interval.front, far_value = interval.back;
       GV_NO_UNROLL
       for (int step = 0; step < 4; ++step) {
         const V middle = near + (far - near) * static_cast<T>(0.5);
@@ -322,8 +323,8 @@ struct Isosurface : ShaderFacts {
     sum.share = select(hit, sum.clear, sum.share);
     sum.clear = select(hit, V{}, sum.clear);
     sum.depth = select(hit, hit_t, sum.depth);
-    sum.last_value = select(passed, piece.back, sum.last_value);
-    sum.last_end = select(passed, piece.end, sum.last_end);
+    sum.last_value = select(passed, interval.back, sum.last_value);
+    sum.last_end = select(passed, interval.end, sum.last_end);
     sum.last_end = select(begins, broadcast<V>(static_cast<T>(INFINITY)), sum.last_end);
   }
   GV_HD Row<T> color_at(const Probe<T>& probe, T t) const {
@@ -384,19 +385,19 @@ struct Projection : ShaderFacts {
     return sum.length > 0 && no_gain;
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe&, SumOf<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe&, SumOf<V>& sum) const {
     const MaskOf<V> first = mask && !(sum.length > 0);
     if (kind() == ProjectionKind::kMean) {
-      sum.value_t = select(first, piece.start, sum.value_t);
-      sum.value = select(mask, sum.value + piece.value * piece.length, sum.value);
+      sum.value_t = select(first, interval.start, sum.value_t);
+      sum.value = select(mask, sum.value + interval.value * interval.length, sum.value);
     } else {
       const bool highest = kind() == ProjectionKind::kMaximum;
-      const MaskOf<V> exceeds = highest ? piece.value > sum.value : piece.value < sum.value;
+      const MaskOf<V> exceeds = highest ? interval.value > sum.value : interval.value < sum.value;
       const MaskOf<V> better = first || (mask && exceeds);
-      sum.value = select(better, piece.value, sum.value);
-      sum.value_t = select(better, piece.middle, sum.value_t);
+      sum.value = select(better, interval.value, sum.value);
+      sum.value_t = select(better, interval.middle, sum.value_t);
     }
-    sum.length = select(mask, sum.length + piece.length, sum.length);
+    sum.length = select(mask, sum.length + interval.length, sum.length);
   }
   GV_HD void done(Sum& sum) const {
     if (!(sum.length > 0)) return;
@@ -419,22 +420,22 @@ struct Features : Plain<T> {
   using Plain<T>::Plain;
 
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
-    const Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum) const {
+    const Row<V> row = look_up(Transfer<T>(this->transfer), interval.value, interval, this->step, mask);
     const V share = sum.clear * row.alpha;
     const MaskOf<V> shown = mask && share > 0;
     if (any(shown)) {
       probe.select_lanes(shown);
       const auto& features = probe.channels.other;
       for (int32_t c = 0; c < features.width; ++c) {
-        const V number = probe.number_at(features, c, piece.middle);
+        const V number = probe.number_at(features, c, interval.middle);
         for_lanes(shown, [&](int lane) {
           T& feature = lane_of(sum.feature_c, lane)[c];
           feature = feature + lane_of(share, lane) * lane_of(number, lane);
         });
       }
     }
-    sum.add(row, piece, mask);
+    sum.add(row, interval, mask);
   }
 };
 
@@ -451,15 +452,15 @@ struct GradientMagnitude : Plain<T> {
       : Plain<T>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
-    Row<V> row = look_up(Transfer<T>(this->transfer), piece.value, piece, this->step, mask);
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum) const {
+    Row<V> row = look_up(Transfer<T>(this->transfer), interval.value, interval, this->step, mask);
     const MaskOf<V> shown = mask && row.alpha > 0;
     if (!any(shown)) return;
     probe.select_lanes(shown);
-    const Vec3<V> slope = probe.gradient(piece.middle);
+    const Vec3<V> slope = probe.gradient(interval.middle);
     const V fraction = saturate(square_root(dot(slope, slope)) / own_numbers<Numbers>(parameters).full);
     row.alpha = select(fraction > 0, stretch(row.alpha, fraction), V{});
-    sum.add(row, piece, shown);
+    sum.add(row, interval, shown);
   }
 };
 

@@ -33,11 +33,11 @@ class Shadows {
     memory.sight[thread] = sight;
   }
   // Adds an interval.
-  __device__ void add(const Piece<T>& piece, const LitPoint<T>& lit_point, const LightCone<T>& to_light,
+  __device__ void add(const Interval<T>& interval, const LitPoint<T>& lit_point, const LightCone<T>& to_light,
                       ShadeSum<T>& sum, int32_t& samples) {
     point[points] = lit_point;
     weight[points] = sum.clear * lit_point.base.alpha;
-    sum.absorb(lit_point.base.alpha, piece);
+    sum.absorb(lit_point.base.alpha, interval);
     if (kernel.light.receives(lit_point)) {
       receiving |= 1u << points;
       memory.cone_t[cones++][thread] = to_light.t;
@@ -132,11 +132,11 @@ struct Shadows {
   const Sight<T>& sight;
   unsigned threads;
 
-  void add(const Piece<T>& piece, const LitPoint<T>& point, const LightCone<T>& cone, ShadeSum<T>& sum,
+  void add(const Interval<T>& interval, const LitPoint<T>& point, const LightCone<T>& cone, ShadeSum<T>& sum,
            int32_t& samples) const {
     const bool receives = kernel.light.receives(point);
     const T share = receives ? kernel.light_share(ray, sight, cone, samples, sum.missed) : static_cast<T>(1);
-    sum.add(kernel.light.in_shadow(point, share), piece);
+    sum.add(kernel.light.in_shadow(point, share), interval);
   }
   void finish(ShadeSum<T>&, int32_t&) const {}
 };

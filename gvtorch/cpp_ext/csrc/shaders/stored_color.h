@@ -63,39 +63,39 @@ struct StoredColor : ShaderFacts {
   };
   GV_HD const Numbers& numbers() const { return own_numbers<Numbers>(light.parameters); }
   template <class V, class AnyProbe>
-  GV_HD V opacity_of(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
+  GV_HD V opacity_of(MaskOf<V> mask, const Interval<V>& interval, const AnyProbe& probe) const {
     const auto& channel = probe.channels.value;
-    const auto read = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, piece.middle); };
-    const V value = channel.width == 4 ? piece.value : of_sides<V>(mask, probe, read);
+    const auto read = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, interval.middle); };
+    const V value = channel.width == 4 ? interval.value : of_sides<V>(mask, probe, read);
     return saturate(value * numbers().scale);
   }
   template <class V, class AnyProbe>
-  GV_HD V alpha(MaskOf<V> mask, const Piece<V>& piece, const AnyProbe& probe) const {
-    return stretch(opacity_of(mask, piece, probe), piece.length / numbers().reference_length);
+  GV_HD V alpha(MaskOf<V> mask, const Interval<V>& interval, const AnyProbe& probe) const {
+    return stretch(opacity_of(mask, interval, probe), interval.length / numbers().reference_length);
   }
   template <class V, class AnyProbe, class... Shadow>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum,
                  const Shadow&... shadow) const {
     const auto& channel = probe.channels.value;
-    const V t = piece.middle;
+    const V t = interval.middle;
     if constexpr (kPacket<V>) {
-      if (channel.width > 4) return add_by_direction(mask, piece, probe, sum, shadow...);
+      if (channel.width > 4) return add_by_direction(mask, interval, probe, sum, shadow...);
       const auto read = [&](int32_t number) { return probe.number_at(channel, number, t); };
       const auto stored = [&](MaskOf<V>) { return Row<V>{read(0), read(1), read(2), V{}}; };
-      add_stored(mask, saturate(piece.value * numbers().scale), stored, piece, probe, sum, shadow...);
+      add_stored(mask, saturate(interval.value * numbers().scale), stored, interval, probe, sum, shadow...);
     } else {
       const auto read = [&](bool, int32_t first) {
         return probe.template four_at<sizeof...(Shadow) != 0>(true, channel, first, t);
       };
       const auto stored = [&](bool) { return channel.width == 4 ? read(true, 0) : of_sides<V>(true, probe, read); };
-      add_stored(mask, opacity_of(mask, piece, probe), stored, piece, probe, sum, shadow...);
+      add_stored(mask, opacity_of(mask, interval, probe), stored, interval, probe, sum, shadow...);
     }
   }
 
  private:
   // Adds an interval; stored(mask) returns the numbers as seen along the ray, of which the fourth is not read.
   template <class V, class Stored, class AnyProbe, class... Shadow>
-  GV_HD void add_stored(MaskOf<V> mask, V opacity, const Stored& stored, const Piece<V>& piece, AnyProbe& probe,
+  GV_HD void add_stored(MaskOf<V> mask, V opacity, const Stored& stored, const Interval<V>& interval, AnyProbe& probe,
                         ShadeSum<V>& sum, const Shadow&... shadow) const {
     const MaskOf<V> shown = mask && opacity > 0;
     if (!any(shown)) return;
@@ -106,21 +106,21 @@ struct StoredColor : ShaderFacts {
       return numbers().premultiplied > 0 ? scaled / opacity : scaled;
     };
     const Row<V> row{color(seen.red), color(seen.green), color(seen.blue),
-                     stretch(opacity, piece.length / numbers().reference_length)};
-    if (numbers().lit > 0) return light.add(shown, row, probe, piece, sum, shadow...);
-    sum.add(row, piece, shown);
+                     stretch(opacity, interval.length / numbers().reference_length)};
+    if (numbers().lit > 0) return light.add(shown, row, probe, interval, sum, shadow...);
+    sum.add(row, interval, shown);
   }
   // A packet's colours by direction: a call, which keeps the loop of other colours as fast as without these.
   template <class V, class AnyProbe, class... Shadow>
-  GV_RARE void add_by_direction(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum,
+  GV_RARE void add_by_direction(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum,
                                 const Shadow&... shadow) const {
     const auto& channel = probe.channels.value;
     const Vec3<V> d = probe.sight.direction;
-    const V t = piece.middle;
+    const V t = interval.middle;
     const auto number = [&](MaskOf<V>, int32_t first) { return probe.number_at(channel, first + 3, t); };
     const auto four = [&](MaskOf<V> lanes, int32_t first) { return probe.four_at(lanes, channel, first, t); };
     const auto stored = [&](MaskOf<V> shown) { return by_direction(shown, d, channel.width, four); };
-    add_stored(mask, saturate(by_direction(mask, d, channel.width, number) * numbers().scale), stored, piece, probe,
+    add_stored(mask, saturate(by_direction(mask, d, channel.width, number) * numbers().scale), stored, interval, probe,
                sum, shadow...);
   }
   template <class V, class AnyProbe, class Read>
@@ -134,9 +134,9 @@ struct StoredColor : ShaderFacts {
 // of their voxels. Where two levels blend, what they show is blended, not their values. `Shader` derives from this and
 // has
 //
-//   contribution(mask, piece, probe, node)       what one of the nodes adds for an interval, of a type that `combined`
+//   contribution(mask, interval, probe, node)    what one of the nodes adds for an interval, of a type that `combined`
 //                                                accepts
-//   add_contribution(mask, added, piece, sum)    adds it to the sum
+//   add_contribution(mask, added, interval, sum) adds it to the sum
 template <class T, class Base, class Shader>
 struct FromAfar : Base {
   int32_t bricks;  // number of bricks that have the second channel
@@ -149,19 +149,19 @@ struct FromAfar : Base {
     return probe.fine.in_first_slots(bricks) || (probe.mixed && probe.coarse.in_first_slots(bricks));
   }
   template <class V, class AnyProbe>
-  GV_HD void add(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, ShadeSum<V>& sum) const {
+  GV_HD void add(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, ShadeSum<V>& sum) const {
     const MaskOf<V> colored = mask && has_stored(probe), uncolored = mask && !colored;
-    if (any(uncolored)) Base::add(uncolored, piece, probe, sum);
+    if (any(uncolored)) Base::add(uncolored, interval, probe, sum);
     if (!any(colored)) return;
     const Shader& shader = static_cast<const Shader&>(*this);
-    auto fine = shader.contribution(colored, piece, probe, probe.fine);
+    auto fine = shader.contribution(colored, interval, probe, probe.fine);
     const MaskOf<V> mixed = colored && probe.mixed;
     if (any(mixed)) {
-      const auto coarse = shader.contribution(mixed, piece, probe, probe.coarse);
-      const V weight = probe.weight(piece.middle);
+      const auto coarse = shader.contribution(mixed, interval, probe, probe.coarse);
+      const V weight = probe.weight(interval.middle);
       fine = combined(fine, coarse, [&](V a, V b) { return select(mixed, a + weight * (b - a), a); });
     }
-    shader.add_contribution(colored, fine, piece, sum);
+    shader.add_contribution(colored, fine, interval, sum);
   }
 };
 
@@ -179,17 +179,19 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
       : FromAfar<T, Plain<T>, Filtered<T>>(args), parameters(static_cast<const Parameters<T>*>(args.parameter_54)) {}
 
   template <class V>
-  GV_HD void add_contribution(MaskOf<V> mask, const Row<V>& color, const Piece<V>& piece, ShadeSum<V>& sum) const {
-    sum.add_premultiplied(color, piece, mask);
+  GV_HD void add_contribution(MaskOf<V> mask, const Row<V>& color, const Interval<V>& interval,
+                              ShadeSum<V>& sum) const {
+    sum.add_premultiplied(color, interval, mask);
   }
   // Premultiplied colour and alpha of an interval in one of the nodes.
   template <class V, class AnyProbe, class Node>
-  GV_HD Row<V> contribution(MaskOf<V> mask, const Piece<V>& piece, AnyProbe& probe, const Node& node) const {
-    const V t = piece.middle;
+  GV_HD Row<V> contribution(MaskOf<V> mask, const Interval<V>& interval, AnyProbe& probe, const Node& node) const {
+    const V t = interval.middle;
     const MaskOf<V> colored = mask && node.in_first_slots(this->bricks), uncolored = mask && !colored;
     Row<V> row{};
     if (any(uncolored)) {
-      const Row<V> plain = look_up(Transfer<T>(this->transfer), probe.value_of(node, t), piece, this->step, uncolored);
+      const Row<V> plain =
+          look_up(Transfer<T>(this->transfer), probe.value_of(node, t), interval, this->step, uncolored);
       row = {plain.red * plain.alpha, plain.green * plain.alpha, plain.blue * plain.alpha, plain.alpha};
     }
     if (!any(colored)) return row;
@@ -199,7 +201,8 @@ struct Filtered : FromAfar<T, Plain<T>, Filtered<T>> {
     const auto read = [&](MaskOf<V> lanes, int32_t first) { return probe.four_of(lanes, colors, first, node, t); };
     const Row<V> seen = by_direction(colored, d, colors.width, read);
     const V stored_alpha = saturate(seen.alpha);
-    const V alpha = stretch(stored_alpha, piece.length * probe.scale_of(node) / own_numbers<Numbers>(parameters).side);
+    const V alpha =
+        stretch(stored_alpha, interval.length * probe.scale_of(node) / own_numbers<Numbers>(parameters).side);
     const V scale = alpha / stored_alpha;
     const MaskOf<V> shown = colored && stored_alpha > 0;
     const auto choose = [&](V color, V plain) { return select(shown, color, select(colored, V{}, plain)); };

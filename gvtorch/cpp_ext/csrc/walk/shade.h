@@ -1,5 +1,5 @@
-// The transfer function as a table; Piece, an interval; and ShadeSum, which composites intervals from front to back. T
-// is as in arithmetic.h.
+// The transfer function as a table; an Interval of a ray; and ShadeSum, which composites intervals from front to back.
+// T is as in arithmetic.h.
 #pragma once
 
 #include "base/arguments.h"
@@ -206,7 +206,7 @@ GV_HD T stretch(T alpha, T lengths) {
 
 // An interval of a ray, or of each ray of a packet.
 template <class T>
-struct Piece {
+struct Interval {
   T start, end, length, middle;  // distances, world units
   IntOf<T> level{};              // the length is step * 2^level, unless `odd`
   T value;                       // in the middle
@@ -237,13 +237,13 @@ struct ShadeSum {
   typename LanesOf<T>::Pointer feature_c;  // of each lane
 
   // Adds an interval of a colour, premultiplied or not.
-  GV_HD void add(const Row<T>& row, const Piece<T>& piece, Mask mask = all_lanes<T>()) {
+  GV_HD void add(const Row<T>& row, const Interval<T>& interval, Mask mask = all_lanes<T>()) {
     add_light(row, clear * row.alpha, mask);
-    absorb(row.alpha, piece, mask);
+    absorb(row.alpha, interval, mask);
   }
-  GV_HD void add_premultiplied(const Row<T>& row, const Piece<T>& piece, Mask mask) {
+  GV_HD void add_premultiplied(const Row<T>& row, const Interval<T>& interval, Mask mask) {
     add_light(row, clear, mask);
-    absorb(row.alpha, piece, mask);
+    absorb(row.alpha, interval, mask);
   }
   // Adds light in a lane, weighted by `share`.
   GV_HD void add_light(int lane, const Row<Real>& row, Real share) {
@@ -260,11 +260,11 @@ struct ShadeSum {
 
   // Takes the light that an interval absorbs. Depth is where in the interval the transmittance falls to hit_clear, as
   // if the interval were homogeneous.
-  GV_HD void absorb(T alpha, const Piece<T>& piece, Mask mask = all_lanes<T>()) {
+  GV_HD void absorb(T alpha, const Interval<T>& interval, Mask mask = all_lanes<T>()) {
     const T clear_after = clear * (1 - alpha);
     for_lanes(mask && clear_after < hit_clear && clear >= hit_clear, [&](int lane) {
       const Real fraction = hit_fraction(lane_of(clear, lane), lane_of(alpha, lane), hit_clear);
-      set_lane(depth, lane, lane_of(piece.start, lane) + fraction * lane_of(piece.length, lane));
+      set_lane(depth, lane, lane_of(interval.start, lane) + fraction * lane_of(interval.length, lane));
     });
     clear = select(mask, clear_after, clear);
   }

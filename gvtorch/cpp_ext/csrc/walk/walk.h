@@ -93,7 +93,7 @@ struct Walk {
   //
   //   kSeesEmpty                       true if EMPTY nodes are visited too
   //   missed()                         a bool&, set where visible data is missing
-  //   goes_on()                        true while the ray goes on to another node
+  //   goes_on()                        false if no further node is to be visited: the ray stops between two nodes
   //   node_words(node)                 the node's NodeWords, with kConcealed where nothing in it is visible
   //   enter(ray, visit, digits)        begins a visit; returns the visitor's data for it, `node` below
   //   uniform(node)                    true if the visit may be taken as one interval
@@ -101,7 +101,7 @@ struct Walk {
   //   take_intervals(node, intervals, run_length, last)
   //                                    takes at most `run_length` whole intervals or, with `last`, the ray's last one,
   //                                    which is cut at the far side; returns how many it took
-  //   sees()                           true while the ray goes on in this node
+  //   sees()                           false if the ray stops within this node, because it can see no farther
   //   finish(node)                     ends a visit whose intervals have been taken
   template <class Digits, class Visitor>
   GV_HD void follow(const Ray<T>& ray, Intervals<T>& intervals, Visitor& visitor) const {
