@@ -326,6 +326,11 @@ def test_an_order_that_names_nothing_is_harmless(walk):
             changed_order = [*order]
             changed_order[number] = torch.full_like(words, value)
             assert op(grad, *changed_order, *reads)[0].isfinite().all()
+    begin = order[3].clone()
+    begin[0] = -(2**63)  # what lies before the first entry is left out
+    assert torch.equal(
+        op(grad, *order[:3], begin, *order[4:], *reads)[0], op(grad, *order, *reads)[0]
+    )
     rows = torch.arange(len(order[4]), device=device)
     for added in (rows, rows.flip(0), rows[:0]):
         assert op(grad, *order[:4], rows, added, *reads)[0].isfinite().all()

@@ -380,7 +380,7 @@ struct SpreadGradient {
 
   GV_HD void operator()(int64_t index) const {
     const int64_t portion = index / kThreads, row = row_p[portion];
-    for (int64_t e = begin_p[portion]; e < smaller(begin_p[portion + 1], entries); ++e) {
+    for (int64_t e = larger(begin_p[portion], int64_t{0}); e < smaller(begin_p[portion + 1], entries); ++e) {
       const Entry found = entry(e);
       const Spot<T>& spot = found.source.first;
       T* sum = row >= 0 && row < rows ? row_xn + row * find.numbers() : gradient(spot);
