@@ -31,6 +31,8 @@ from gvtorch.cpp_ext import compilers, instructions, user
 
 BANDS = {"density": 0.4, "width": 3.0, "fade": 0.005}
 CAMERA = gv.Camera.orbit(30, 20, 1.3, width=24, height=24)
+FORM = "a shader has GV_HD void add(const gv::Interval<T>&, const gv::Probe<T>&, Sum&)"
+NOWHERE = "  static float nowhere(T);" + ADD.replace("COLOR", "T(nowhere(1))")
 
 
 @pytest.fixture(scope="module")
@@ -318,17 +320,9 @@ def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, mo
     ("body", "name", "message"),
     [
         (ADD.replace("COLOR", "colour"), "Own", r"own.h:8:\d+: error: 'colour' was not declared"),
-        (
-            "",
-            "Own",
-            "a shader has GV_HD void add(const gv::Interval<T>&, const gv::Probe<T>&, Sum&)",
-        ),
+        ("", "Own", FORM),
         (ADD, "Mine", "'Mine' does not name a type"),
-        (
-            "  static float nowhere(T);" + ADD.replace("COLOR", "T(nowhere(1))"),
-            "Own",
-            "undefined reference to ['`]Own<double>::nowhere\\(double\\)'",
-        ),
+        (NOWHERE, "Own", r"undefined reference to ['`]Own<double>::nowhere\(double\)'"),
     ],
     ids=["a mistake", "no add", "no such struct", "no such function"],
 )
