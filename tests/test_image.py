@@ -294,6 +294,9 @@ def test_a_batch_is_laid_side_by_side(tmp_path, tree):
         (lambda p, t: gv.read_image(written(t / "b.png", b"x")), "b.png: can't be read: no PNG"),
         (lambda p, t: gv.read_image(written(t / "b.npy", b"x")), "b.npy: can't be read"),
         (lambda p, t: gv.read_image(flat(t / "c.npy")), "must hold (h, w, 3) numbers, got (3, 4)"),
+        (lambda p, t: gv.read_image(tiff(t / "c.tif", 5)), "must be RGB, got SEPARATED"),
+        (lambda p, t: gv.read_image(tiff(t / "b.tif", 6)), "must be RGB, got YCBCR"),
+        (lambda p, t: gv.read_image(tiff(t / "b8.tif", 8)), "must be RGB, got CIELAB"),
     ],
 )
 def test_bad_input_is_named(tmp_path, call, message):
@@ -306,6 +309,15 @@ def test_bad_input_is_named(tmp_path, call, message):
 
 def written(path, content: bytes):
     path.write_bytes(content)
+    return path
+
+
+def tiff(path, photometric: int):
+    """Writes a TIFF of three numbers a pixel, or of four inks."""
+    import tifffile
+
+    pixels = np.zeros((3, 5, 4 if photometric == 5 else 3), np.uint8)
+    tifffile.imwrite(path, pixels, photometric=photometric, planarconfig="contig")
     return path
 
 

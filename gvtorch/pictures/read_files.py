@@ -26,7 +26,7 @@ from ..io.budget import MAX_UNPACK_RATIO, check_regular, header_budget
 from ..io.picture_size import picture_size
 from ..io.resources import amount, memory_free
 from ..io.source import convert_errors
-from ..io.tiff_info import check_pictures, opened_tiff
+from ..io.tiff_info import JPEG, check_pictures, opened_tiff
 from .tone import from_srgb
 
 _ASSOCIATED_ALPHA = 1  # as an extra sample of TIFF: colours are premultiplied, as Blender writes
@@ -204,6 +204,10 @@ def _read_tiff(path: Path) -> np.ndarray:
         max_bytes = MAX_UNPACK_RATIO * path.stat().st_size
         _check_size(path, tuple(series.shape), series.dtype.itemsize, max_bytes)
         check_pictures(series.pages)
+        photometric, compression = series.keyframe.photometric, series.keyframe.compression
+        if photometric not in (1, 2) and (photometric != 6 or compression not in JPEG):
+            kind = getattr(photometric, "name", photometric)  # tifffile decodes YCbCr of JPEG only
+            raise ValueError(f"its colours must be RGB, got {kind}")
         pixels = series.asarray()
         if "S" in series.axes:
             pixels = np.moveaxis(pixels, series.axes.index("S"), -1)
