@@ -158,7 +158,7 @@ def test_a_text_model_of_colmap(tmp_path):
     )
     half = math.sqrt(0.5)
     (tmp_path / "images.txt").write_text(
-        "# Image list with two lines of data per image:\n"
+        "# Image list with two lines of data per image:\n\n"
         f"1 {half} 0 0 {half} 0.5 -1 10 1 first picture.jpg\n2362.39 248.498 58396\n"
         "2 1 0 0 0 0 0 5 2 second.jpg\n\n"
     )
@@ -170,6 +170,22 @@ def test_a_text_model_of_colmap(tmp_path):
     )
     pixel = seen(cameras["second.jpg"], torch.tensor([(1.0, 0, -1)], dtype=torch.float64))
     assert torch.allclose(pixel, torch.tensor([(420.0, 240.0)]).double())
+
+
+@pytest.mark.parametrize("second", ["b.jpg", "b c.jpg", "b c d.jpg", "a.jpg"])
+def test_no_image_of_colmap_is_lost(tmp_path, second):
+    """Another program left out the lines of points, or wrote a name twice."""
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
+    images = ["1 1 0 0 0 0 0 5 1 a.jpg", f"2 1 0 0 0 0 0 6 1 {second}", ""]
+    (tmp_path / "images.txt").write_text("\n".join(images))
+    with pytest.raises(ValueError, match="after the line of an image comes one of its points"):
+        gv.read_cameras(tmp_path)
+    (tmp_path / "images.txt").write_text("\n\n".join(images))
+    if second == "a.jpg":
+        with pytest.raises(ValueError, match=r"there are two images 'a\.jpg'"):
+            gv.read_cameras(tmp_path)
+    else:
+        assert list(gv.read_cameras(tmp_path)) == ["a.jpg", second]
 
 
 def test_damaged_and_unknown_files_are_one_line(tmp_path):
@@ -218,6 +234,8 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
         ("a.pvcc", gv.Camera.look_at([EYE, UP], TARGET), ".pvcc holds one camera, got 2"),
         ("a.json", gv.Camera.look_at(EYE, TARGET, model="ortho"), "pinhole and fisheye"),
         ("a.json", gv.Camera.orbit(), "must be one camera in the world"),
+        ("a.json", gv.CustomCamera(askew().rays()), "one camera in the world, of a model"),
+        ("a.pvcc", gv.CustomCamera(askew().rays()), "one camera in the world, of a model"),
         ("a.json", {"a b": askew()}, "must not contain blanks"),
         ("a.json", {}, "there are no cameras"),
         ("a.txt", askew(), "must end in .pvcc or .json or be a folder"),

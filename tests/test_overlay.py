@@ -95,7 +95,8 @@ def test_a_pixel_is_as_wide_as_the_rays_are_apart():
         middle = hits.view(33, 65, 3)[16]
         wide = float(middle[40, 0] - middle[39, 0])
         assert abs(camera.pixel_width(8.0) - wide) < 1e-9
-    for bad in (gv.Camera.orbit(), gv.Camera.look_at((0, 0, 9), (0, 0, 1), model="fisheye")):
+    fisheye = gv.Camera.look_at((0, 0, 9), (0, 0, 1), model="fisheye", width=4, height=4)
+    for bad in (gv.Camera.orbit(), fisheye, gv.CustomCamera(fisheye.rays())):
         with pytest.raises(ValueError, match="takes one pinhole or ortho camera in the world"):
             bad.pixel_width(8.0)
 

@@ -362,8 +362,9 @@ class Camera:
         Raises:
             ValueError: It is a fisheye or a panorama, a batch, or relative to a box.
         """
-        context, model = "Camera.pixel_width", MODELS[self.model]
-        if not model.planar or len(self) != 1 or self.frame is not Coordinates.WORLD:
+        context, model = "Camera.pixel_width", MODELS.get(self.model)
+        placed = len(self) == 1 and self.frame is Coordinates.WORLD
+        if model is None or not (model.planar and placed):  # None: of a `CustomCamera`
             wanted = "one pinhole or ortho camera in the world"
             raise ValueError(f"{context}: takes {wanted}, got {self}")
         distance = check.number(context, "distance", distance, low=0, open_low=True)

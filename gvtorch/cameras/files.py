@@ -30,6 +30,7 @@ from ..base import check
 from ..base.messages import one_line
 from ..base.whole_file import write_text
 from .camera import Camera
+from .models import MODELS
 from .motion import quaternion_of, rotation_of
 from .poses import Coordinates
 
@@ -115,8 +116,9 @@ def write_cameras(
         cameras = {f"{n:04d}.png": cameras[n] for n in range(len(cameras))}
     for name, camera in cameras.items():
         check.instance(context, "cameras", camera, Camera)
-        if camera.frame is Coordinates.BOX or len(camera) != 1:
-            raise ValueError(f"{context}: {name!r} must be one camera in the world, got {camera}")
+        if camera.frame is Coordinates.BOX or len(camera) != 1 or camera.model not in MODELS:
+            wanted = "one camera in the world, of a model"
+            raise ValueError(f"{context}: {name!r} must be {wanted}, got {camera}")
         if not name or any(letter.isspace() for letter in name):
             raise ValueError(f"{context}: names must not contain blanks, got {name!r}")
     if not cameras:
@@ -295,8 +297,10 @@ def _read_colmap(path: Path) -> dict[str, Camera]:
         lens = dict(zip(_parameters_of(model), map(float, values), strict=True))
         lenses[number] = (model, lens, (int(x), int(y)))
     cameras = {}
-    for line in _read_lines(path / "images.txt", every=2):
+    for line in _read_lines(path / "images.txt", points=True):
         _, *numbers, number, name = line.split(maxsplit=9)
+        if name in cameras:
+            raise ValueError(f"there are two images {name!r}")
         pose = check.reals(f"image {name}", "pose", [float(n) for n in numbers], (7,))
         view = torch.eye(4, dtype=torch.float64, device="cpu")
         view[:3, :3], view[:3, 3] = rotation_of(pose[:4].tolist()), pose[4:]
@@ -312,14 +316,21 @@ def _read_text(path: Path) -> str:
         raise ValueError("is not a text file") from None
 
 
-def _read_lines(path: Path, every: int = 1) -> list[str]:
-    """Returns the lines of a text without comments, in images.txt every other one: each image's
-    line is followed by one with its points, which may be empty.
+def _read_lines(path: Path, *, points: bool = False) -> list[str]:
+    """Returns the lines of a text without comments and empty ones. In images.txt each of them is
+    followed by a line with the image's `points`, which may be empty and is left out.
     """
     if not path.is_file():
         raise ValueError(f"has no {path.name}")
-    lines = [line for line in _read_text(path).splitlines() if not line.startswith("#")]
-    return [line for line in lines[::every] if line.strip()]
+    kept, lines = [], iter(_read_text(path).splitlines())
+    for line in lines:
+        if line.startswith("#") or not line.strip():
+            continue
+        kept.append(line)
+        numbers = next(lines, "").split() if points else []  # x, y, and the number of a point
+        if len(numbers) % 3 or (numbers and not numbers[-1].lstrip("-").isdigit()):
+            raise ValueError(f"{path.name}: after the line of an image comes one of its points")
+    return kept
 
 
 def _colmap_texts(cameras: Mapping[str, Camera]) -> dict[str, str]:
