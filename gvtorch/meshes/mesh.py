@@ -13,6 +13,15 @@ _WELD_STEPS = 2.0**40  # steps along a mesh's longest side; vertices that round 
 MOST_FACES = 2**28  # most triangles of a mesh: with their hierarchy, they would take 100 GB
 
 
+def _check_color(context: str, color: np.ndarray) -> None:
+    """Raises ValueError unless all of (..., 4) are light >= 0 and an opacity in [0, 1]."""
+    low, high, opaque = (float(end) for end in (color.min(), color.max(), color[..., 3].max()))
+    if not (low >= 0 and high < np.inf and opaque <= 1):  # so bytes are refused
+        wanted = "finite, light >= 0, opacity 0 to 1"
+        got = f"{low:g} to {high:g}, opacity up to {opaque:g}"
+        raise ValueError(f"{context}: color must be {wanted}, got {got}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Material:
     """The look of some triangles of a mesh."""
@@ -22,8 +31,9 @@ class Material:
     texture: np.ndarray | None = field(default=None, repr=False)  # (h, w, 4) uint8, sRGB; row 0 top
 
     def __post_init__(self) -> None:
-        """Raises ValueError if a field has the wrong shape or dtype, or a colour is not finite."""
-        check.reals(f"material {self.name!r}", "color", self.color, (4,))
+        """Raises ValueError if a field has the wrong shape or dtype, or is no colour."""
+        color = check.reals(f"material {self.name!r}", "color", self.color, (4,))
+        _check_color(f"material {self.name!r}", color.numpy())
         texture = self.texture
         if texture is not None and not (
             isinstance(texture, np.ndarray)
@@ -99,6 +109,10 @@ class Mesh:
         bad = int((~np.isfinite(used)).any(1).sum())
         if bad:
             raise ValueError(f"{self.name}: {bad} corners of triangles are NaN or infinite")
+        if self.color is not None:
+            _check_color(self.name, self.color)
+        if self.uv is not None and not np.isfinite(self.uv).all():
+            raise ValueError(f"{self.name}: uv must be finite, got NaN or infinity")
         assert self.material is not None
         for entry in check.items(self.name, "materials", self.materials):
             check.instance(self.name, "each of materials", entry, Material)
