@@ -175,6 +175,8 @@ def test_presets_need_values_or_have_them():
         gv.TransferFunction.preset("gray")
     with pytest.raises(ValueError, match="give low and high"):
         gv.TransferFunction.preset("ct-bone", 3)
+    with pytest.raises(ValueError, match="high must be >= low, got 400 and -100"):
+        gv.TransferFunction.preset("gray", 400, -100)
     with pytest.raises(ValueError, match=r"unknown preset 'bnoe'.*\(did you mean bone"):
         gv.TransferFunction.preset("bnoe", 0, 1)
 

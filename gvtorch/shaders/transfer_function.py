@@ -150,13 +150,15 @@ class TransferFunction(Shader):
         return function if low is None or high is None else function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
-        """Returns the function with its first corner point moved to `low` and its last to `high`. A
-        `high` that is not above `low` becomes low + max(1, 1e-6 |low|).
+        """Returns the function with its first corner point moved to `low` and its last to `high`. If
+        both are equal, `high` becomes low + max(1, 1e-6 |low|). ValueError if `high` is below.
         """
         context = "TransferFunction.stretched"
         low = check.number(context, "low", low, low=-LARGEST, high=LARGEST)
         high = check.number(context, "high", high, low=-LARGEST, high=LARGEST)
-        if not high > low:
+        if high < low:
+            raise ValueError(f"{context}: high must be >= low, got {low:g} and {high:g}")
+        if high == low:
             high = low + max(1.0, 1e-6 * abs(low))
         first, last, _ = self.corners()
         parts = []
