@@ -107,6 +107,7 @@ def test_integers_of_numpy_are_extents():
         (lambda: gv.MeshProducer(triangle(), channels=5), "channels must be a list, got 5"),
         (lambda: gv.MeshProducer(triangle(), band=1e300), "voxelize: band must be finite and >= 2"),
         (lambda: gv.SampledDistance.of_mesh(triangle(), resolution=2**20), "GiB"),
+        (lambda: gv.Points(np.eye(3), np.eye(3)).lit(), "values of 3 numbers: light is one number"),
         (lambda: gv.PointProducer(POINTS, box=3), "sort_points: box must be two corners, got 3"),
         (lambda: gv.CameraPath(5, 5), "CameraPath: eye must be a list, got 5"),
         (lambda: gv.CameraPath([(0, 0, 1)], [(0, 0, 0)], fov=30), "fov must be a list, got 30"),

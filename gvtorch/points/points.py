@@ -75,9 +75,13 @@ class Points:
     def lit(self, opacity: float = 1e-4) -> Points:
         """Returns points whose values are light: red, green, blue (the first value times the
         colour, or times white without colours) and an opacity, as read by
-        `gv.StoredColor("value", premultiplied=True)`.
+        `gv.StoredColor("value", premultiplied=True)`. ValueError if there are no colours, but
+        values of three or more numbers, which are likely to be colours.
         """
         check.number("Points.lit", "opacity", opacity, low=0, high=1, open_low=True)
+        if self.colors is None and self.width > 2:
+            problem = f"values of {self.width} numbers: light is one number, colours are `colors`"
+            raise ValueError(f"Points.lit: {problem}")
         color = np.ones((1, 3)) if self.colors is None else self.colors
         light = self.values[:, :1] * color
         return replace(self, values=np.concatenate((light, np.full_like(light[:, :1], opacity)), 1))
