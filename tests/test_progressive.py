@@ -297,6 +297,8 @@ def test_what_breaks_off_leaves_no_file(blobs, tmp_path):
         (lambda t, c: gv.Progressive(print).refine(c, 0), "samples must be an int >= 1, got 0"),
         (lambda t, c: gv.Progressive(print).frame(3), "camera must be a Camera, got int"),
         (lambda t, c: gv.render_tiles(3, c, t / "a.tif"), "render must be callable, got int"),
+        (lambda t, c: gv.render_tiles(repr, c, t / "a.tif"), "returns must be a Picture, got str"),
+        (lambda t, c: gv.Progressive(repr).frame(c), "returns must be a Picture, got str"),
         (
             lambda t, c: gv.render_tiles(print, c, t / "a.exr"),
             "must end in .png, .tif or .npy, got",

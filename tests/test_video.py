@@ -118,6 +118,14 @@ def test_bad_films_are_named(tmp_path, make, message):
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_a_film_without_pictures_is_none(tmp_path, name):
+    with pytest.raises(ValueError, match=f"no picture was added to .*{name}"):
+        with gv.Video(tmp_path / name, WIDTH, HEIGHT):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
 def test_pictures_are_added_within_the_block_only(tmp_path, name):
     video = gv.Video(tmp_path / name, WIDTH, HEIGHT)
     with pytest.raises(RuntimeError, match="within its with block"):

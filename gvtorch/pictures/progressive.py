@@ -51,7 +51,8 @@ def _renderer(context: str, render: Callable[[Camera], Any]) -> Callable[[Camera
 
     def picture(camera: Camera) -> Picture:
         result = render(camera)
-        return result[0] if isinstance(result, tuple) else result
+        result = result[0] if isinstance(result, tuple) else result
+        return check.instance(context, "what render returns", result, Picture)
 
     return picture
 

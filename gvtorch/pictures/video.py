@@ -72,16 +72,22 @@ class Video:
         if pixels.shape != (height, width, 3):
             raise ValueError(f"Video: picture must be ({height}, {width}, 3), got {pixels.shape}")
         self._film.add(pixels)
+        self._count += 1
 
     def __enter__(self) -> Video:
         with ExitStack() as stack:  # closes the file if the film can't be opened
             self._film.open(stack.enter_context(whole_file(self._path)))
-            stack.push(lambda error_type, *_: self._film.close(complete=error_type is None))
-            self._stack = stack.pop_all()
+            stack.push(self._close)
+            self._stack, self._count = stack.pop_all(), 0
         return self
 
+    def _close(self, error_type: type[BaseException] | None, *_: object) -> None:
+        self._film.close(complete=error_type is None and self._count > 0)
+        if error_type is None and not self._count:
+            raise ValueError(f"Video: no picture was added to {str(self._path)!r}")
+
     def __exit__(self, *error: Any) -> None:
-        """Finishes the file, or deletes it after an error."""
+        """Finishes the file, or deletes it after an error, or if there is no picture (ValueError)."""
         stack, self._stack = self._stack, None
         if stack is not None:
             stack.__exit__(*error)
