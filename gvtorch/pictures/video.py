@@ -87,7 +87,7 @@ class Video:
             raise ValueError(f"Video: no picture was added to {str(self._path)!r}")
 
     def __exit__(self, *error: Any) -> None:
-        """Finishes the file, or deletes it after an error, or if there is no picture (ValueError)."""
+        """Finishes the file, or deletes it after an error; without pictures raises ValueError."""
         stack, self._stack = self._stack, None
         if stack is not None:
             stack.__exit__(*error)

@@ -150,8 +150,8 @@ class TransferFunction(Shader):
         return function if low is None or high is None else function.stretched(low, high)
 
     def stretched(self, low: float, high: float) -> TransferFunction:
-        """Returns the function with its first corner point moved to `low` and its last to `high`. If
-        both are equal, `high` becomes low + max(1, 1e-6 |low|). ValueError if `high` is below.
+        """Returns the function with its first corner point moved to `low` and its last to `high`; a
+        `high` equal to `low` becomes low + max(1, 1e-6 |low|). Raises ValueError if it is below.
         """
         context = "TransferFunction.stretched"
         low = check.number(context, "low", low, low=-LARGEST, high=LARGEST)
