@@ -74,6 +74,19 @@ def test_the_first_picture_of_a_flight_is_whole(scan_store, tmp_path):
 
 
 @pytest.mark.backend("cpp")
+def test_pictures_of_a_longer_flight_are_told(small, tmp_path):
+    """They stay, and who makes a film of the folder would not notice them."""
+    args = ("fly", small, "-o", tmp_path / "f", "--size", "8x8", "--frames")
+    assert "older" not in gvtorch(*args, "3").stderr
+    (tmp_path / "f" / "1.png").touch()
+    shorter = gvtorch(*args, "1").stderr
+    assert (
+        "holds older pictures as well: 0001.png, 2 in all" in shorter and "\n" not in shorter[:-1]
+    )
+    assert "older" not in gvtorch(*args, "3").stderr
+
+
+@pytest.mark.backend("cpp")
 def test_up_turns_orbits_flights_and_keys(small, tmp_path):
     """By default the whole ball is visible, in the middle."""
     seen = {}

@@ -278,6 +278,37 @@ def test_resume_refuses_a_source_that_has_changed(tmp_path, raw, monkeypatch):
         convert(raw, tmp_path / "a.zarr", resume=True)
 
 
+@pytest.mark.parametrize("kind", ["file", "slices", "image"])
+def test_a_source_that_changes_meanwhile_is_told(tmp_path, raw, data, kind, monkeypatch):
+    """Its store would hold parts of both versions. Other files beside slices do not count."""
+    source = changed = raw
+    if kind == "slices":
+        source = tmp_path / "slices"
+        source.mkdir()
+        for number, plane in enumerate(data[..., 0]):
+            changed = source / f"{number}.png"
+            changed.write_bytes(pytest.importorskip("imagecodecs").png_encode(plane))
+    elif kind == "image":
+        source = write_foreign(tmp_path / "image", [data[..., 0]], "zyx", [[1.0] * 3])
+        changed = source / "s0" / "c" / "0" / "0" / "0"
+    original = shard.create_arrays
+
+    def create(conversion, level):
+        if "memory" not in conversion.root["driver"]:
+            os.utime(changed, ns=(1, 1))
+        original(conversion, level)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shard, "create_arrays", create)
+        with pytest.raises(ValueError, match="has changed while it was converted; remove"):
+            convert(source, tmp_path / "a.zarr", workers=1)
+        with pytest.raises(ValueError, match="half-written"):
+            Store.open(tmp_path / "a.zarr")
+        changed = source / "log.txt" if kind == "slices" else tmp_path / "log.txt"
+        changed.touch()
+        assert_holds(convert(source, tmp_path / "b.zarr", workers=1), data)
+
+
 def test_resume_refuses_an_image_whose_chunks_have_changed(tmp_path, data, monkeypatch):
     image = write_foreign(tmp_path / "image", [data[..., 0]], "zyx", [[1.0] * 3])
     with monkeypatch.context() as patch:

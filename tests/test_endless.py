@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import socketserver
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -26,7 +27,7 @@ from helpers.servers import WebServer
 from helpers.stores import noise, write_foreign
 
 import gvtorch as gv
-from gvtorch.io import http, relay
+from gvtorch.io import http, relay, remote
 from gvtorch.io.http import read_http
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.store import Store
@@ -332,6 +333,46 @@ def test_parts_of_files_that_never_end(server, tmp_path):
     with pytest.raises(TimeoutError):
         read_http(url, 10**6, seconds=0.3)
     assert read_http(f"{server.url}/none", 9) is None
+
+
+ANSWER = b"HTTP/1.1 200 OK\r\n"
+UNENDING = {  # what comes first, and what comes again and again
+    "header": (ANSWER + b"X: ", b"x"),
+    "before the answer": (b"", b"HTTP/1.1 100 Continue\r\n\r\n"),
+    "behind the body": (ANSWER + b"Transfer-Encoding: chunked\r\n\r\n1\r\nx\r\n0\r\n", b"X: x\r\n"),
+    "body": (ANSWER + b"Content-Length: 999999\r\n\r\n", b"x"),
+    "redirected": (b"HTTP/1.1 302 Found\r\nLocation: /b\r\nContent-Length: 0\r\n\r\n", b""),
+}
+
+
+class Unending(socketserver.BaseRequestHandler):
+    def handle(self) -> None:
+        path = self.request.recv(1 << 16).split()[1].decode()
+        first, again = UNENDING["header" if path == "/b" else self.server.how]
+        with contextlib.suppress(OSError):
+            self.request.sendall(first)
+            while again and not self.server.over:
+                self.request.sendall(again)
+                time.sleep(0.02)
+
+
+@pytest.mark.parametrize("how", UNENDING)
+def test_headers_and_what_is_around_a_body_end_too(how, tmp_path, monkeypatch):
+    monkeypatch.setenv("GVTORCH_CACHE", str(tmp_path))
+    monkeypatch.setattr(http, "STALL_SECONDS", 0.3)
+    monkeypatch.setattr(remote, "_PART_SECONDS", 0.3)
+    server: Any = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Unending)
+    server.daemon_threads, server.how, server.over = True, how, False
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    url, start = f"http://127.0.0.1:{server.server_address[1]}", time.monotonic()
+    with pytest.raises(http.Endless, match="hardly anything"):
+        read_http(f"{url}/a.npy", 999)
+    with pytest.raises(OSError, match="hardly anything"):
+        remote.fetch(f"{url}/a.npy")
+    assert time.monotonic() - start < 10, "both wait 0.3 s"
+    server.over = True
+    server.shutdown()
+    server.server_close()
 
 
 class _Racing(dict):

@@ -244,6 +244,13 @@ def test_damaged_metadata_is_told(store, attributes):
         gv.Filtered.stored(store)
 
 
+def test_metadata_that_is_not_json_is_named(store):
+    gv.Filtered.add_to(store, MISTY)
+    (store / "gvtorch" / "coarse" / "zarr.json").write_text("[")
+    with pytest.raises(ValueError, match=r"a\.zarr/gvtorch/coarse/zarr\.json: damaged JSON"):
+        gv.Filtered.stored(store)
+
+
 def test_mistakes_are_told(store, tmp_path):
     with pytest.raises(ValueError, match="component must be"):
         gv.Filtered.add_to(store, MISTY, component=1)

@@ -19,6 +19,7 @@ from helpers.stores import noise, stopped_at
 
 import gvtorch as gv
 from gvtorch.io import remote
+from gvtorch.io.http import read_http
 from gvtorch.io.stores.conversion import convert
 from gvtorch.io.stores.store import Store
 
@@ -31,6 +32,7 @@ class Server(WebServer):
     modified: str | None = None
     sized = True
     packed = False
+    status = 200
     cut = 0
     sent: list[str]
 
@@ -59,7 +61,9 @@ class Handler(BaseHTTPRequestHandler):
             self.end_headers()
             return
         server.sent.append(self.path)
-        self.send_response(200)
+        self.send_response(server.status)
+        if server.status == 302:
+            self.send_header("Location", "ftp://127.0.0.1/x/a.npy")
         for header, value in (("ETag", server.tag), ("Last-Modified", server.modified)):
             if value:
                 self.send_header(header, value)
@@ -185,6 +189,21 @@ def test_a_broken_download_leaves_nothing(tmp_path, server, grid):
     assert not kept(tmp_path)
     with pytest.raises(FileNotFoundError, match="volume not found: http"):
         gv.read_volume(f"{server.url}/none.npy")
+    server.files["/x/a.npy"] = gzip.compress(server.files["/x/a.npy"])
+    for server.packed, server.sized in ((True, True), (True, False)):
+        with pytest.raises(OSError, match=r"is cut off: what is packed is cut off"):
+            gv.read_volume(f"{server.url}/x/a.npy")
+    assert not kept(tmp_path)
+
+
+@pytest.mark.parametrize("status", [206, 302])
+def test_a_part_or_another_protocol_is_refused(tmp_path, server, grid, status):
+    server.status = status
+    with pytest.raises(OSError, match=r"206 Partial Content|unknown url type: ftp"):
+        gv.read_volume(f"{server.url}/x/a.npy")
+    with pytest.raises(OSError, match=r"206 Partial Content|unknown url type: ftp"):
+        read_http(f"{server.url}/x/a.npy", 9999)
+    assert not kept(tmp_path)
 
 
 @pytest.mark.parametrize("name", ["a.npy", "a.npy.gz", "b.npy.gz"])
@@ -203,7 +222,7 @@ def test_without_a_network_the_copy_is_used(server, grid, monkeypatch):
     def fail(*_: object, **__: object) -> None:
         raise OSError("no route to host")
 
-    monkeypatch.setattr("urllib.request.urlopen", fail)
+    monkeypatch.setattr(remote, "ask_by_urllib", fail)
     with pytest.warns(UserWarning, match=r"no answer \(no route to host\); using the cached copy"):
         gv.read_volume(url)
     with pytest.raises(OSError, match="can't be downloaded: no route to host"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -270,6 +271,27 @@ def test_folders_that_are_no_stack(tmp_path):
     image.save(folder / "c.bmp")
     with pytest.raises(ValueError, match="images of several kinds: 1 bmp and 2 png"):
         gv.read_volume(folder)
+
+
+@pytest.mark.parametrize(
+    ("names", "gap"),
+    [
+        ("s1 s2 s9 s10 s11", "s9.png follows s2.png"),
+        ("scan3_05 scan3_10 scan3_20", "scan3_20.png follows scan3_10.png"),
+        ("s0 s10 s20", ""),
+        ("a1 b2 c9", ""),
+        ("t1_z1 t1_z2 t2_z1 t2_z2", ""),
+        ("only", ""),
+    ],
+)
+def test_slices_that_seem_to_be_missing_are_told(tmp_path, names, gap):
+    for name in names.split():
+        Image.fromarray(np.zeros((4, 5), "u1")).save(tmp_path / f"{name}.png")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        gv.read_volume(tmp_path)
+    told = [f"{tmp_path}: not kept: gaps between the numbers of its slices: {gap}"] if gap else []
+    assert [str(warning.message) for warning in caught] == told
 
 
 def write_slices(folder: Path, images: np.ndarray, **options) -> Path:

@@ -14,6 +14,7 @@ from helpers.stores import noise
 
 import gvtorch as gv
 from gvtorch.engine import setup
+from gvtorch.io import resources
 from gvtorch.io.reading import open_source
 from gvtorch.io.stores import conversion
 
@@ -107,3 +108,33 @@ def test_threads_of_openmp_sleep_soon_unless_the_user_tells_otherwise(given):
     )
     assert run.stdout.strip() == given.get("GOMP_SPINCOUNT", "None" if given else "2000")
     assert torch.get_num_threads() >= 1
+
+
+@pytest.mark.parametrize(
+    ("cgroup", "group", "files", "left"),
+    [
+        ("0::/", "", "v2", 3000),
+        ("0::/pod/job", "pod", "v2", 3000),
+        ("0::/a/../b", "none", "v2", None),
+        ("3:cpu:/\n4:memory,hugetlb:/docker/1\n0::/", "memory", "v1", 3000),
+        ("3:cpu:/docker/1", "memory", "v1", None),
+        ("0::/", "", "unlimited", None),
+    ],
+)
+def test_a_container_has_the_memory_that_its_limit_leaves(
+    tmp_path, monkeypatch, cgroup, group, files, left
+):
+    """Its group may be the one that it is in, one above, or the root of what it sees."""
+    proc, groups = tmp_path / "proc", tmp_path / "groups"
+    (proc / "self").mkdir(parents=True)
+    (groups / group).mkdir(parents=True)
+    (proc / "meminfo").write_text("MemTotal: 99 kB\nMemAvailable: 9 kB\n")
+    (proc / "self/cgroup").write_text(cgroup + "\n")
+    limit, usage, prefix = resources._GROUP_V1 if files == "v1" else resources._GROUP_V2
+    (groups / group / limit).write_text("max\n" if files == "unlimited" else "8000\n")
+    (groups / group / usage).write_text("7000\n")
+    stat = f"{prefix}inactive_file 1500\n{prefix}active_file 500\nanon 5000\ninactive_file_x 9\n"
+    (groups / group / "memory.stat").write_text(stat)
+    monkeypatch.setattr(resources, "_PROC", proc)
+    monkeypatch.setattr(resources, "_CGROUPS", groups)
+    assert resources.memory_free() == (9 * 1024 if left is None else left)

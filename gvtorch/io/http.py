@@ -1,6 +1,6 @@
 """`read_http`: reads a file, or a part of it, over http or https, within bounds of size and time
-whatever the server does. Connections are kept open and reused; proxies and redirections are left to
-urllib.
+whatever the server does. Connections are kept open and reused; proxies and redirections, which
+lead to http and https alone, are left to urllib.
 """
 
 from __future__ import annotations
@@ -139,9 +139,8 @@ def _read(
     if byte_range is not None:
         last = "" if byte_range.stop is None else byte_range.stop - 1
         headers["Range"] = f"bytes={first}" if first < 0 else f"bytes={first}-{last}"
-    patience = max(1e-3, min(deadline - time.monotonic(), STALL_SECONDS))
     try:
-        connection, response = _send_request(url, headers, patience)
+        connection, response = _send_request(url, headers, deadline)
     except TimeoutError:
         raise
     except HttpStatus as error:
@@ -154,15 +153,13 @@ def _read(
     try:
         if response.status in MISSING_STATUS:
             return None
-        if response.status not in (200, 206):
+        if response.status not in ((200,) if byte_range is None else (200, 206)):
             raise HttpStatus(response.status, response.reason)
         content_range = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
         if content_range and byte_range and int(content_range[1]) != first >= 0:
             raise OSError(f"another part came: {content_range[0]}")
         body_range = byte_range if response.status == 200 else None
-        content = _read_content(
-            url, response, deadline, max_bytes, body_range, max_file_bytes, connection
-        )
+        content = _read_content(url, response, max_bytes, body_range, max_file_bytes, connection)
         is_complete = response.isclosed()
         return content
     finally:
@@ -175,8 +172,7 @@ def _read(
 
 def _read_content(
     url: str,
-    response: http.client.HTTPResponse,
-    deadline: float,
+    response: TimedResponse,
     max_bytes: int,
     body_range: slice | None,
     max_file_bytes: int,
@@ -190,8 +186,6 @@ def _read_content(
     start, stop = (body_range.start or 0, body_range.stop) if body_range is not None else (0, None)
     limit = max_bytes if body_range is None else max_file_bytes
     while stop is None or content_start + len(content) < stop:
-        if time.monotonic() > deadline:
-            raise TimeoutError
         try:
             chunk = stream.read1(_PART_BYTES)
         except TimeoutError:
@@ -228,11 +222,11 @@ def unpacked(url: str, response: http.client.HTTPResponse) -> Any:
     is_packed = response.headers.get("Content-Encoding") in ("gzip", "x-gzip", "deflate")
     if not is_packed or response.status == 206:
         return response
-    from .packed import GZIP_MAGIC, ZlibStream
+    from .packed import GZIP_MAGIC, ZlibStream, new_unpacker
 
     start = response.peek(1)
     if urllib.parse.urlsplit(url).path.endswith("gz"):
-        start = ZlibStream(io.BytesIO(start)).read(2) if start.startswith(GZIP_MAGIC) else b""
+        start = new_unpacker().decompress(start, 2) if start.startswith(GZIP_MAGIC) else b""
     if not start.startswith((GZIP_MAGIC, b"x")):
         return response
     return io.BufferedReader(ZlibStream(response))
@@ -245,21 +239,51 @@ def is_forbidden(error: OSError) -> bool:
     return re.search(r"\b403 |PERMISSION_DENIED", str(error)) is not None
 
 
+class TimedResponse(http.client.HTTPResponse):
+    """An answer that is read until `deadline`, of time.monotonic: then whatever reads it, also its
+    header, raises TimeoutError. http.client alone would wait forever for a server that sends a
+    header a byte at a time, or "100 Continue" or lines behind the body without an end.
+    """
+
+    def __init__(self, *args: Any, deadline: float, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.deadline = deadline
+        self.fp = io.BufferedReader(_TimedStream(self, self.fp.detach()))
+
+
+class _TimedStream(io.RawIOBase):
+    def __init__(self, response: TimedResponse, stream: io.RawIOBase) -> None:
+        self._response, self._stream = response, stream
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        if time.monotonic() > self._response.deadline:
+            raise TimeoutError("the server sends hardly anything")
+        return self._stream.readinto(buffer)
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
 def _send_request(
-    url: str, headers: dict[str, str], seconds: float
-) -> tuple[http.client.HTTPConnection | None, http.client.HTTPResponse]:
+    url: str, headers: dict[str, str], deadline: float
+) -> tuple[http.client.HTTPConnection | None, TimedResponse]:
     """Returns a connection (None if it is urllib's), and the answer, whose body is not read yet."""
     url_parts = urllib.parse.urlsplit(_quoted(url))
     request_target = url_parts.path + (f"?{url_parts.query}" if url_parts.query else "")
     proxied = url_parts.scheme in urllib.request.getproxies()
     if proxied and not urllib.request.proxy_bypass(url_parts.hostname or ""):
-        return None, ask_by_urllib(url, headers, seconds)
+        return None, ask_by_urllib(url, headers, deadline)
     while True:
-        connection, is_reused = _connections.take(url, seconds)
+        connection, is_reused = _connections.take(url, _stall_seconds(deadline))
+        connection.response_class = _response_class(deadline)
         try:
             connection.request("GET", request_target, headers=headers)
             _connections.note_activity(connection)
-            response = connection.getresponse()
+            response: Any = connection.getresponse()
         except BaseException as error:
             _connections.give_back(url, connection, keep=False)
             if is_reused and isinstance(error, _CLOSED_ERRORS):
@@ -269,7 +293,16 @@ def _send_request(
             return connection, response
         response.close()
         _connections.give_back(url, connection, keep=False)
-        return None, ask_by_urllib(url, headers, seconds)
+        return None, ask_by_urllib(url, headers, deadline)
+
+
+def _stall_seconds(deadline: float) -> float:
+    """Returns the seconds for which a connection may send nothing."""
+    return max(1e-3, min(deadline - time.monotonic(), STALL_SECONDS))
+
+
+def _response_class(deadline: float) -> Any:
+    return functools.partial(TimedResponse, deadline=deadline)
 
 
 def _quoted(url: str) -> str:
@@ -280,11 +313,37 @@ def _quoted(url: str) -> str:
     return urllib.parse.urlunsplit((parts.scheme, parts.netloc, path, query, ""))
 
 
-def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.client.HTTPResponse:
+class _TimedHttp(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
+    """Opens http and https URLs with `TimedResponse`s."""
+
+    def __init__(self, deadline: float) -> None:
+        urllib.request.HTTPSHandler.__init__(self)
+        self._deadline = deadline
+
+    def do_open(self, http_class: Any, req: Any, **http_conn_args: Any) -> Any:
+        def connect(host: str, **options: Any) -> Any:
+            connection = http_class(host, **options)
+            connection.response_class = _response_class(self._deadline)
+            return connection
+
+        return super().do_open(connect, req, **http_conn_args)
+
+
+def ask_by_urllib(url: str, headers: dict[str, str], deadline: float) -> TimedResponse:
     """Sends a request through proxies and redirections; raises as `read_http`, except Endless."""
+    opener = urllib.request.OpenerDirector()
+    for handler in (
+        urllib.request.ProxyHandler(),
+        _TimedHttp(deadline),
+        urllib.request.HTTPRedirectHandler(),
+        urllib.request.HTTPDefaultErrorHandler(),
+        urllib.request.HTTPErrorProcessor(),
+        urllib.request.UnknownHandler(),
+    ):
+        opener.add_handler(handler)
     try:
         request = urllib.request.Request(_quoted(url), headers=headers)
-        response: http.client.HTTPResponse = urllib.request.urlopen(request, timeout=seconds)
+        response: Any = opener.open(request, timeout=_stall_seconds(deadline))
     except urllib.error.HTTPError as error:
         error.close()
         raise HttpStatus(error.code, error.reason) from None
@@ -294,6 +353,7 @@ def ask_by_urllib(url: str, headers: dict[str, str], seconds: float) -> http.cli
         raise OSError(str(error.reason)) from None
     except (http.client.HTTPException, ValueError) as error:  # no URL
         raise OSError(one_line(error)) from None
+    assert isinstance(response, TimedResponse)
     return response
 
 

@@ -48,10 +48,12 @@ def open_unpacked(
 
 
 class ZlibStream(io.RawIOBase):
-    """What an open file or an answer unpacks to by zlib, or by gzip, from its position on."""
+    """What an open file or an answer unpacks to by zlib, or by gzip, from its position on. Raises
+    EOFError where it is cut off.
+    """
 
     def __init__(self, packed: io.BufferedIOBase) -> None:
-        self._file, self._unpacker = packed, zlib.decompressobj(zlib.MAX_WBITS | 32)
+        self._file, self._unpacker = packed, new_unpacker()
 
     def readable(self) -> bool:
         return True
@@ -62,10 +64,15 @@ class ZlibStream(io.RawIOBase):
         while not part and not self._unpacker.eof:
             packed = self._unpacker.unconsumed_tail or self._file.read1(_READ_BYTES)
             if not packed:
-                break
+                raise EOFError("what is packed is cut off")
             part = self._unpacker.decompress(packed, len(buffer))
         buffer[: len(part)] = part
         return len(part)
+
+
+def new_unpacker() -> Any:
+    """Returns what unpacks a stream of zlib or gzip."""
+    return zlib.decompressobj(zlib.MAX_WBITS | 32)
 
 
 def unpack_block(codec: str, packed: Any, needed_bytes: int) -> bytes:

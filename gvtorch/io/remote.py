@@ -16,7 +16,9 @@ import os
 import re
 import shutil
 import tempfile
+import time
 import warnings
+from collections.abc import Generator, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import IO, Any
@@ -25,11 +27,19 @@ from urllib.parse import unquote, urlsplit
 from ..base.digits import finite_number, whole_number
 from ..base.messages import need_library, one_line
 from ..base.whole_file import cache_folder, write_text
-from .http import MISSING_STATUS, REQUEST_HEADERS, HttpStatus, ask_by_urllib, unpacked
+from .http import (
+    MIN_BYTES_PER_SECOND,
+    MISSING_STATUS,
+    REQUEST_HEADERS,
+    HttpStatus,
+    TimedResponse,
+    ask_by_urllib,
+    unpacked,
+)
 from .resources import amount
 
-_TIMEOUT = 30.0  # seconds without a byte
 _PART_BYTES = 1 << 20  # bytes
+_PART_SECONDS = 30.0 + _PART_BYTES / MIN_BYTES_PER_SECOND  # for an answer to begin, and for a part
 _FOLDER_ENDINGS = ("zarr", "n5")  # read in parts from the server, not downloaded
 _DETACHED_HEADERS = (".mhd", ".nhdr")
 
@@ -87,10 +97,10 @@ def fetch(url: str) -> Path:
         assert cached is not None
         os.utime(cached[0].parent)
         return cached[0]
-    stream, size, version = download
-    with closing(stream):
+    parts, size, version = download
+    with closing(parts):
         folder.mkdir(parents=True, exist_ok=True)
-        file = _download(url, folder, stream, size)
+        file = _download(url, folder, parts, size)
     key = hashlib.sha256(json.dumps(version, sort_keys=True).encode()).hexdigest()[:16]
     version_folder = folder / (key if version else file.parent.name.strip(".").split("-")[1])
     try:
@@ -134,7 +144,7 @@ def _cached_copy(folder: Path) -> tuple[Path, Version] | None:
     return (file, version) if file.is_file() else None
 
 
-Download = tuple[IO[bytes], int | None, Version]
+Download = tuple[Generator[bytes, None, None], int | None, Version]
 
 
 def _open_http(url: str, known_version: Version) -> Download | None:
@@ -142,17 +152,22 @@ def _open_http(url: str, known_version: Version) -> Download | None:
     validators = (("ETag", "If-None-Match"), ("Last-Modified", "If-Modified-Since"))
     conditions = {header: known_version[n] for n, header in validators if known_version.get(n)}
     try:
-        response = ask_by_urllib(url, REQUEST_HEADERS | conditions, _TIMEOUT)
+        deadline = time.monotonic() + _PART_SECONDS
+        response = ask_by_urllib(url, REQUEST_HEADERS | conditions, deadline)
     except HttpStatus as error:
         if error.status == 304 and known_version:
             return None
         if error.status in MISSING_STATUS:
             raise FileNotFoundError(f"volume not found: {url}") from None
         raise
+    if response.status != 200:
+        response.close()
+        raise HttpStatus(response.status, response.reason)
     length = response.headers.get("Content-Length", "")
     version = {name: response.headers[name] for name, _ in validators if response.headers.get(name)}
     stream = unpacked(url, response)
-    return stream, whole_number(length) if stream is response else None, version
+    size = whole_number(length) if stream is response else None
+    return _read_parts(url, stream, response), size, version
 
 
 def _open_fsspec(url: str, known_version: Version) -> Download | None:
@@ -186,11 +201,12 @@ def _open_fsspec(url: str, known_version: Version) -> Download | None:
     size = info.get("size")
     if version == known_version and len(version) > 1:
         return None
-    return system.open(path, "rb"), size if isinstance(size, int) else None, version
+    parts = _read_parts(url, system.open(path, "rb"))
+    return parts, size if isinstance(size, int) else None, version
 
 
-def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Path:
-    """Writes a stream to a file in a new folder, which is removed again if that fails."""
+def _download(url: str, folder: Path, parts: Iterable[bytes], size: int | None) -> Path:
+    """Writes parts to a file in a new folder, which is removed again if that fails."""
     limit = cache_limit()
     free = shutil.disk_usage(folder).free
     max_bytes = min(limit, free)
@@ -201,7 +217,7 @@ def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Pa
     try:
         file, received = target / _file_name(url), 0
         with file.open("wb") as out:
-            while part := _read_part(url, stream):
+            for part in parts:
                 received += len(part)
                 if received > max_bytes:
                     raise OSError(f"{url}: is more than {amount(max_bytes)}, the room in {medium}")
@@ -214,11 +230,23 @@ def _download(url: str, folder: Path, stream: IO[bytes], size: int | None) -> Pa
     return file
 
 
-def _read_part(url: str, stream: IO[bytes]) -> bytes:
-    try:
-        return stream.read(_PART_BYTES)
-    except Exception as error:  # http.client and fsspec have exceptions of their own
-        raise OSError(f"{url}: is cut off: {_reason(error)}") from None
+def _read_parts(
+    url: str, stream: IO[bytes], response: TimedResponse | None = None
+) -> Generator[bytes, None, None]:
+    """Yields the parts of a stream; raises OSError if it is cut off, or if the `response` that it
+    comes from takes longer than `_PART_SECONDS` for one.
+    """
+    with closing(stream):
+        while True:
+            if response is not None:
+                response.deadline = time.monotonic() + _PART_SECONDS
+            try:
+                part = stream.read(_PART_BYTES)
+            except Exception as error:  # http.client and fsspec have exceptions of their own
+                raise OSError(f"{url}: is cut off: {_reason(error)}") from None
+            if not part:
+                return
+            yield part
 
 
 def _evict(newest: Path) -> None:

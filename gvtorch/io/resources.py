@@ -17,6 +17,12 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+_PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+# Files of a control group: its limit, its use, and a prefix of names in memory.stat.
+_GROUP_V1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_"
+_GROUP_V2 = "memory.max", "memory.current", ""
+
+
 def amount(nbytes: float) -> str:
     """Formats a number of bytes for messages: "3.2 kB", "3.2 MB", "1.50 GB"."""
     if nbytes >= 1e9:
@@ -30,14 +36,49 @@ def cores() -> int:
 
 
 def memory_free() -> int:
-    """Returns the memory available without swapping, bytes; half of all if that is unknown."""
+    """Returns the memory available without swapping, bytes: the machine's, half of all if that is
+    unknown, or what is left of a limit on a container or a batch job.
+    """
+    return min([_machine_memory_free(), *_limits_left()])
+
+
+def _machine_memory_free() -> int:
     try:
-        for line in Path("/proc/meminfo").read_text().splitlines():
+        for line in (_PROC / "meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
     except OSError:
         pass
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+
+
+def _limits_left() -> Iterator[int]:
+    """Yields what is left, bytes, of the limits on this process's control group and on those above
+    it; files that the kernel may drop from memory do not count as used.
+    Source: Linux kernel documentation, admin-guide, cgroup-v2 and cgroup-v1/memory.
+    """
+    try:
+        lines = (_PROC / "self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        controllers, _, path = line.partition(":")[2].partition(":")
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        folder = _CGROUPS / "memory" if controllers else _CGROUPS
+        names = path.strip("/").split("/")  # a container may see its own group in the place of all
+        for group in [folder, *(folder.joinpath(*names[: n + 1]) for n in range(len(names)))]:
+            yield from _limit_left(group, *(_GROUP_V1 if controllers else _GROUP_V2))
+
+
+def _limit_left(group: Path, limit: str, usage: str, prefix: str) -> Iterator[int]:
+    try:
+        bytes_left = int((group / limit).read_text()) - int((group / usage).read_text())
+        lines = map(str.split, (group / "memory.stat").read_text().splitlines())
+        files = {f"{prefix}{kind}_file" for kind in ("active", "inactive")}
+        yield max(0, bytes_left + sum(int(size) for name, size in lines if name in files))
+    except (OSError, ValueError):  # there is no such group or no limit ("max")
+        return
 
 
 def check_memory(context: str, nbytes: int) -> None:

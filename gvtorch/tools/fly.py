@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import re
+import warnings
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -116,6 +119,8 @@ class Fly:
                         with stage("save"):
                             writer.add(number, camera, picture)
             bar("frames", frames, frames)
+        if film is None:
+            self._warn_of_older_pictures(frames)
         if self.poses is not None:
             write_cameras(self.poses, writer.cameras)
         note = f", {writer.incomplete} of them are not complete" if writer.incomplete else ""
@@ -136,6 +141,16 @@ class Fly:
         check_outputs({**inputs, **files}, {**outputs, "--trace": self.trace})
         if is_film and options["background"] is None:
             raise ValueError(f"--background transparent is for pictures, not {self.output.suffix}")
+
+    def _warn_of_older_pictures(self, frames: int) -> None:
+        """Warns of pictures that an earlier, longer flight left in the folder."""
+        numbers = (re.fullmatch(r"(\d{4,})\.png", name) for name in os.listdir(self.output))
+        older = [match[0] for match in numbers if match is not None and int(match[1]) >= frames]
+        if older:
+            warnings.warn(
+                f"{self.output}: holds older pictures as well: {min(older)}, {len(older)} in all",
+                stacklevel=2,
+            )
 
     def _loops(self) -> bool:
         """Whether the path ends where it begins, so that its last picture is left out."""

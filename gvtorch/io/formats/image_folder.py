@@ -13,6 +13,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,7 @@ def open_folder(path: str) -> SlicesSource:
             is_color, dropped = shown_as(series, width)
     elif kind == "jpeg8" and width == 4:
         dropped.append(INKS)
+    dropped += _gaps([file.name for file in files])
     return SlicesSource(
         path=path,
         shape=(len(files), *first.shape),
@@ -160,3 +162,19 @@ def _natural_key(name: str) -> list[tuple[int, str]]:
     """Returns a sorting key, by which s9 comes before s10."""
     parts = re.split(r"(\d+)", name)
     return [(int(part) if part.isdecimal() else -1, part) for part in parts]
+
+
+def _gaps(names: list[str]) -> list[str]:
+    """Returns a phrase on slices that seem to be missing: names differ in a single number, in steps
+    that are not all equal.
+    """
+    keys = [_natural_key(name) for name in names]
+    if len({tuple(text if number < 0 else "" for number, text in key) for key in keys}) > 1:
+        return []
+    numbers = [[number for number, _ in key] for key in keys]
+    varying = [column for column in zip(*numbers, strict=True) if len(set(column)) > 1]
+    steps = [b - a for a, b in pairwise(varying[0])] if len(varying) == 1 else []
+    if len(set(steps)) < 2:
+        return []
+    index = steps.index(max(steps))
+    return [f"gaps between the numbers of its slices: {names[index + 1]} follows {names[index]}"]

@@ -92,8 +92,8 @@ def convert(
 
     Raises:
         FileExistsError: There is something at `store` already.
-        ValueError: The source is damaged or holds NaN, an argument is invalid, or `resume` finds
-            a store of other settings or of a source that has changed.
+        ValueError: The source is damaged, holds NaN or changes meanwhile, an argument is invalid,
+            or `resume` finds a store of other settings or of a source that has changed.
         OSError: The disk is full, or a file can't be read or written; `resume` continues.
         KeyboardInterrupt: It was interrupted; `resume` continues, as the message says.
     """
@@ -194,6 +194,7 @@ def _write_store(plan: Plan, begun: bool, executor: Executor | None, progress: P
                 source = task.source.staged(plan.target / WORK)
                 task = dataclasses.replace(task, source=source)
             _write_levels(plan, task, unfinished_store, pool, progress)
+        plan.check_source()
         if plan.labels is not None:
             shard.write_label_array(task, plan.labels)
         layout = dataclasses.replace(task.layout, value_range=_value_range(task))

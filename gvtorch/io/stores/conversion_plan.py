@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 import shutil
 import zlib
 from collections.abc import Sequence
@@ -19,7 +20,13 @@ from ...base.volume import Volume, movable
 from .. import resources
 from ..label_source import IndexSource
 from ..oblique import Oblique, StraightSource
-from ..reading import FormatSettings, open_source, read_time_points, with_placement
+from ..reading import (
+    FormatSettings,
+    ObjectSource,
+    open_source,
+    read_time_points,
+    with_placement,
+)
 from ..source import MemorySource, VolumeSource, check_time
 from . import shard, unfinished
 from .level_reader import pool_of
@@ -74,6 +81,15 @@ class Plan:
     labels: np.ndarray | None  # (k,) int64, the table of indexed labels, or None
     workers: int
     uses_processes: bool
+    source_files: list[Any]  # sizes and times of change of the files that are read
+
+    def check_source(self) -> None:
+        """Raises ValueError if a file of the source has changed since the plan was made."""
+        if self.source_files != _source_files(self.task.source, self.target):
+            raise ValueError(
+                f"{self.settings['source']}: has changed while it was converted; remove "
+                f"{self.target} and convert it again"
+            )
 
 
 def source_of(
@@ -184,6 +200,7 @@ def plan_of(
         labels=label_values,
         workers=min(workers, tasks[0]),
         uses_processes=tasks[0] > _FEW_TASKS,
+        source_files=_source_files(source, target),
     )
 
 
@@ -295,8 +312,7 @@ def _fingerprint(user_source: Any, source: VolumeSource, target: Path) -> list[A
     is_file = isinstance(user_source, (str, Path))
     fields: list[Any] = [list(source.shape), source.stored]
     fields = unfinished.fingerprint(source.path, target) if is_file else fields
-    while isinstance(source, (IndexSource, StraightSource)):
-        source = source.inner
+    source = _innermost(source)
     if isinstance(source, MemorySource):
         return [*fields, unfinished.checksum([source.data])]
     if not Path(source.path).is_dir():  # files beside the one that was named
@@ -305,3 +321,20 @@ def _fingerprint(user_source: Any, source: VolumeSource, target: Path) -> list[A
             fields += unfinished.fingerprint(file)
     # What is read of it: the chosen array, its axes, byte order, ...
     return [*fields, zlib.crc32(repr(source).replace(source.path, "").encode())]
+
+
+def _innermost(source: VolumeSource) -> VolumeSource:
+    while isinstance(source, (IndexSource, StraightSource)):
+        source = source.inner
+    return source
+
+
+def _source_files(source: VolumeSource, target: Path) -> list[Any]:
+    """Returns sizes and times of change of the files that a source reads later; of a folder, if it
+    does not name them, those of all its files.
+    """
+    source = _innermost(source)
+    if isinstance(source, (MemorySource, ObjectSource)) or source.fingerprint() is not None:
+        return []
+    files = getattr(source, "files", ()) or {getattr(source, "file", source.path)}
+    return [unfinished.fingerprint(f, target) for f in sorted(files) if os.path.exists(f)]

@@ -113,8 +113,8 @@ class Store:
         if own_layout:
             place = context, self.root, layout, time
             self._blocks = BlockReader(*place, self._levels, channel_index, deadline)
-            folder = child(self.root, self.coarse_folder)
-            if (metadata := read_json(context, folder, "zarr.json", deadline)) is not None:
+            folder, name = child(self.root, self.coarse_folder), f"{context}/{self.coarse_folder}"
+            if (metadata := read_json(name, folder, "zarr.json", deadline)) is not None:
                 self.coarse = CoarseChannel.parse(context, metadata.get("attributes"))
             checksum = json_checksum(pyramid.store_json)
             if pyramid.store_json.get("checksum", checksum) != checksum:
