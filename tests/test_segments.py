@@ -267,11 +267,15 @@ def gradients(walked, weight) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("real", [torch.float32, torch.float64])
-@pytest.mark.parametrize("branching", [2, 3])
-def test_gradients_have_the_same_bits_in_every_run(blobs, compiled, branching, real, monkeypatch):
+@pytest.mark.parametrize(("branching", "width"), [(2, 1), (3, 1), (2, 2), (2, 5)])
+def test_gradients_have_the_same_bits_in_every_run(
+    blobs, compiled, branching, width, real, monkeypatch
+):
     """Whatever the number of threads, and on a GPU as on a CPU; with bricks in many portions."""
     monkeypatch.setattr("gvtorch.ops.segments._PORTION_ENTRIES", 5)
-    tree = gv.N3Tree.from_volume(blobs, 4, branching=branching)
+    numbers = torch.cat([blobs.data / (1 + c) for c in range(width)], -1)
+    volume = gv.Volume(numbers, spacing=blobs.spacing, origin=blobs.origin)
+    tree = gv.N3Tree.from_volume(volume, 4, branching=branching)
     rays, threads = camera_rays(tree, 24, distance=1.5), torch.get_num_threads()
     results = []
     for backend, number in (("cpp", 1), ("cpp", 3), (compiled, 2), (compiled, 2)):
@@ -280,7 +284,8 @@ def test_gradients_have_the_same_bits_in_every_run(blobs, compiled, branching, r
             ray_args, traced = tracing(tree, backend, rays, dtype=real, hides=False)
             segments = trace_segments(ray_args, traced)
             samples = list_samples(segments)
-            weight = torch.linspace(-1, 1.1, len(samples.segment), dtype=real)[:, None]
+            weight = torch.linspace(-1, 1.1, len(samples.segment) * width, dtype=real)
+            weight = weight.view(-1, width)
             walked = (ray_args, traced, segments, samples)
             results.append([grad.cpu() for grad in gradients(walked, weight)])
         finally:

@@ -24,9 +24,9 @@ def lasting(function: Function) -> Function:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
+        # Frames call this often, and seldom in any mode.
         inference, transform = torch.is_inference_mode_enabled(), in_transform()
-        casting = _casting()
-        if not (inference or transform or casting):
+        if not (inference or transform or torch._C._is_any_autocast_enabled()):
             return function(*args, **kwargs)
         with ExitStack() as modes:
             if inference:
@@ -36,7 +36,7 @@ def lasting(function: Function) -> Function:
                 from torch._functorch import pyfunctorch  # loaded by these transforms
 
                 modes.enter_context(pyfunctorch.temporarily_clear_interpreter_stack())
-            _stop(casting, modes)
+            _stop_autocast(modes)
             return function(*args, **kwargs)
 
     return cast("Function", run)
@@ -47,11 +47,8 @@ def without_autocast(function: Function) -> Function:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        casting = _casting()
-        if not casting:
-            return function(*args, **kwargs)
         with ExitStack() as modes:
-            _stop(casting, modes)
+            _stop_autocast(modes)
             return function(*args, **kwargs)
 
     return cast("Function", run)
@@ -59,15 +56,11 @@ def without_autocast(function: Function) -> Function:
 
 def in_transform() -> bool:
     """Returns whether a transform of `torch.func`, such as `grad` or `vmap`, is running."""
-    return (
-        not torch.compiler.is_compiling() and torch._C._functorch.maybe_current_level() is not None
-    )
+    functorch = torch._C._functorch
+    return functorch.maybe_current_level() is not None and not torch.compiler.is_compiling()
 
 
-def _casting() -> list[str]:
-    return [name for name in ("cpu", "cuda") if torch.is_autocast_enabled(name)]
-
-
-def _stop(casting: list[str], modes: ExitStack) -> None:
-    for name in casting:
-        modes.enter_context(torch.autocast(name, enabled=False))
+def _stop_autocast(modes: ExitStack) -> None:
+    for name in ("cpu", "cuda"):
+        if torch.is_autocast_enabled(name):
+            modes.enter_context(torch.autocast(name, enabled=False))

@@ -247,8 +247,8 @@ def _spreading_order(
     segment_k: Tensor, node_s2: Tensor, brick_s2: Tensor, bricks: int, nodes: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Returns in what order the gradient of `sample_bricks` is added up: (e,) sorted entries, their
-    segments (e,) and lengths (e,), the portions' first entries (p + 1,) and rows (p,), and (x,) the
-    portions with rows; see `SpreadGradient` in csrc/shaders/segments.h.
+    segments (e,) and lengths (e,), the portions' first entries (p + 1,) and rows (p,), and the
+    bricks (x,) of rows; see `SpreadGradient` in csrc/shaders/segments.h.
     """
     if not len(node_s2):
         segment_k = segment_k[:0]
@@ -257,23 +257,26 @@ def _spreading_order(
     segment = segment_k[run]
     exists = ((segment >= 0) & (segment < len(node_s2)))[:, None]
     index = segment.clamp(0, len(node_s2) - 1).to(torch.int64)
-    node, brick, none = node_s2[index], brick_s2[index], bricks + nodes
+    node, brick = node_s2[index], brick_s2[index]
     exists = exists & (node >= 0) & (node < nodes) & (brick < bricks)
     exists[:, 1] &= node[:, 0] != node[:, 1]
-    word = torch.int32 if none < 2**31 else torch.int64  # less to sort
+    entry = exists.flatten().nonzero()[:, 0]
+    word = torch.int32 if bricks + nodes < 2**31 else torch.int64  # less to sort
     # What an entry adds to: a brick or, behind all of these, a node's constants.
-    target = torch.where(brick >= 0, brick.to(word), node.to(word) + bricks)
-    target, order = torch.where(exists, target, none).flatten().sort(stable=True)
-    begins = _begins(target)
-    index = torch.arange(len(target), device=target.device)
-    number = index - begins.nonzero()[:, 0][begins.cumsum(0) - 1]  # among those of its target
-    count = exists.sum().view(1)
-    portion = ((number % _PORTION_ENTRIES == 0) & (index < count)).nonzero()[:, 0]
-    is_added = number[portion] > 0
+    target = torch.where(brick >= 0, brick.to(word), node.to(word) + bricks).flatten()[entry]
+    target, order = target.sort(stable=True)
+    entry = entry[order]
+    targets = torch.arange(bricks + nodes + 1, dtype=word, device=target.device)
+    first = torch.searchsorted(target, targets)  # the first entry of each target, and the end
+    portions = (first.diff() + _PORTION_ENTRIES - 1) // _PORTION_ENTRIES
+    owner = torch.repeat_interleave(portions)  # the target of each portion
+    number = torch.arange(len(owner), device=owner.device) - (portions.cumsum(0) - portions)[owner]
+    begin = torch.cat((first[owner] + number * _PORTION_ENTRIES, first[-1:]))
+    is_added = number > 0
     row = torch.where(is_added, is_added.cumsum(0) - 1, -1)
-    entry = torch.stack((2 * run, 2 * run + 1), 1).flatten()[order]
-    portions = torch.cat((portion, count)), row, is_added.nonzero()[:, 0]
-    return entry, segment[order // 2], length[order // 2], *portions
+    run_index, level = entry // 2, entry % 2
+    entry = 2 * run[run_index] + level
+    return entry, segment[run_index], length[run_index], begin, row, owner[is_added]
 
 
 def _begins(values: Tensor) -> Tensor:
@@ -286,10 +289,10 @@ def _begins(values: Tensor) -> Tensor:
 @_spreading_order.register_fake
 def _fake_order(segment_k: Tensor, *_: Any) -> tuple[Tensor, ...]:
     size = torch.library.get_ctx().new_dynamic_size
-    runs, portions, rows = size(), size(), size()
-    counts, long = (portions + 1, portions, rows), torch.int64
-    entries = (segment_k.new_empty(2 * runs, dtype=dtype) for dtype in (long, None, None))
-    return (*entries, *(segment_k.new_empty(count, dtype=long) for count in counts))
+    entries, portions, rows = size(), size(), size()
+    words = (segment_k.new_empty(entries, dtype=dtype) for dtype in (torch.int64, None, None))
+    counts = (portions + 1, portions, rows)
+    return (*words, *(segment_k.new_empty(count, dtype=torch.int64) for count in counts))
 
 
 def _sample_gradient(ctx: Any, grad_kc: Tensor) -> tuple[Tensor | None, ...]:

@@ -110,13 +110,17 @@ inline auto run(const SampleBricksBackwardOp& a) {
     const Like like{a.origin_r3, a.distance_s3.scalar_type()};
     const int64_t voxel_width = find.width, side = find.side;
     STD_TORCH_CHECK(a.begin_p.numel() > 0, "gvtorch: begin_p needs an end");
-    SpreadGradient<decltype(real)> args{find, a.segment_k.numel(), a.entry_e.numel(), a.begin_p.numel() - 1,
-                                        a.added_x.numel()};
+    SpreadGradient<decltype(real)> args{find,
+                                        a.segment_k.numel(),
+                                        a.entry_e.numel(),
+                                        a.begin_p.numel() - 1,
+                                        a.brick_x.numel(),
+                                        SpreadGradient<decltype(real)>::channels_of(find.width)};
     GV_GRADIENT(GV_CHECK_AND_SET)
     grad_bzyxc = make_zeros(args.grad_bzyxc, a.grad_kc, {a.bricks_bzyxc.size(0), side, side, side, voxel_width});
     grad_tnc = make_zeros(args.grad_tnc, a.grad_kc, {a.constant_tnc.size(0), a.constant_tnc.size(1), voxel_width});
     const Tensor row_xn = make_zeros(args.row_xn, a.grad_kc, {args.rows, find.numbers()});
-    for_each(a.origin_r3, args.portions * args.kThreads, args);
+    for_each(a.origin_r3, args.portions * args.threads(), args);
     for_each(a.origin_r3, args.rows * find.numbers(), AddRows<decltype(real)>{args});
   });
   return std::make_tuple(grad_bzyxc, grad_tnc);

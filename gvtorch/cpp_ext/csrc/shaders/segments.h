@@ -38,7 +38,7 @@ namespace gvtorch {
   X(Words, length_e, args.entries)             \
   X(Longs, begin_p, args.portions + 1)         \
   X(Longs, row_p, args.portions)               \
-  X(Longs, added_x, args.rows)
+  X(Longs, brick_x, args.rows)
 
 // Packed samples of rays: those of a ray are consecutive, from front to back. In scope for the limits: rays
 #define GV_PACKED(X)                           \
@@ -247,20 +247,24 @@ struct FindSamples {
   int64_t segments, nodes;
   GV_SAMPLES(GV_TYPED_VIEW)
 
-  struct Source {
+  // Where a segment's samples lie, and how much of each is the coarse node's.
+  struct Line {
     bool valid = false;  // everything the segment refers to exists
     bool mixed = false;
-    Spot<T> first, second;  // of the fine node, or of the one node that was asked for; of the coarse one, if mixed
-    T cone_near, cone_growth, voxel, blend;
-    T base, end, length;
-    int32_t count, level;  // number of the first interval; kOdd: there is one, from base to end
+    int32_t count{}, level{};  // number of the first interval; kOdd: there is one, from base on
+    T base{}, length{};
+    T cone_near{}, cone_growth{}, voxel{}, blend{};
 
     // Distance of a sample, the middle of an interval.
     GV_HD T middle(int32_t number) const {
       const T half = static_cast<T>(0.5);
-      return level < 0 ? base + (end - base) * half : base + (static_cast<T>(count + number) + half) * length;
+      return base + (level < 0 ? half : static_cast<T>(count + number) + half) * length;
     }
     GV_HD T weight(T t) const { return saturate((cone_near + cone_growth * t - voxel) * blend); }
+  };
+  struct Source {
+    Line line;
+    Spot<T> first, second;  // of the fine node, or of the one node that was asked for; of the coarse one, if mixed
   };
 
   GV_HD Source operator()(int64_t segment, bool only_fine = false, bool only_coarse = false) const {
@@ -278,23 +282,22 @@ struct FindSamples {
         return source;
     }
     if (ray_number < 0 || ray_number >= walk.order.rays || wanted < 0 || wanted > tree.max_depth) return source;
-    source.valid = true;
-    source.mixed = holders[1].node != holders[0].node;
+    Line& line = source.line;
+    line.valid = true;
+    line.mixed = holders[1].node != holders[0].node;
     const Ray<T> ray(walk.rays, ray_number);
     const Digits<T> digits(tree, walk.levels, walk.rays, ray, distance_s3[3 * segment + 2]);
     source.first = Spot<T>(only_coarse ? holders[1] : holders[0], digits, ray, border);
-    if (source.mixed && !only_fine && !only_coarse) source.second = Spot<T>(holders[1], digits, ray, border);
-    source.cone_near = ray.cone_near;
-    source.cone_growth = ray.cone_growth;
-    source.voxel = walk.levels.voxel[wanted];
-    source.blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - source.voxel);
-    source.base = distance_s3[3 * segment];
-    source.end = distance_s3[3 * segment + 1];
-    source.count = interval_s3[3 * segment];
-    source.level = interval_s3[3 * segment + 2];
-    source.length = walk.step;
-    for (int32_t power = 0; power < smaller(source.level, kMaxLevels); ++power)
-      source.length = source.length + source.length;
+    if (line.mixed && !only_fine && !only_coarse) source.second = Spot<T>(holders[1], digits, ray, border);
+    line.cone_near = ray.cone_near;
+    line.cone_growth = ray.cone_growth;
+    line.voxel = walk.levels.voxel[wanted];
+    line.blend = 1 / ((wanted > 0 ? walk.levels.voxel[wanted - 1] : static_cast<T>(INFINITY)) - line.voxel);
+    line.base = distance_s3[3 * segment];
+    line.count = interval_s3[3 * segment];
+    line.level = interval_s3[3 * segment + 2];
+    line.length = line.level < 0 ? distance_s3[3 * segment + 1] - line.base : walk.step;
+    for (int32_t power = 0; power < smaller(line.level, kMaxLevels); ++power) line.length = line.length + line.length;
     return source;
   }
   // How many numbers a brick has.
@@ -309,13 +312,14 @@ struct SampleBricks {
 
   GV_HD void operator()(int64_t k) const {
     const auto source = samples(samples.segment_k[k]);
-    const T t = source.valid ? source.middle(samples.number_k[k]) : 0;
+    const auto& line = source.line;
+    const T t = line.valid ? line.middle(samples.number_k[k]) : 0;
     const int32_t width = samples.width;
     for (int32_t c = 0; c < width; ++c) {
       T value = 0;
-      if (source.valid) {
+      if (line.valid) {
         value = read(source.first, t, c);
-        if (source.mixed) value = value + source.weight(t) * (read(source.second, t, c) - value);
+        if (line.mixed) value = value + line.weight(t) * (read(source.second, t, c) - value);
       }
       value_kc[k * width + c] = value;
     }
@@ -339,100 +343,155 @@ struct SampleBricks {
 //   length_e    its number of samples
 //   begin_p     each portion's first entry, and the end of the last one
 //   row_p       the row that a portion adds to; -1: the gradient
-//   added_x     the portions that have rows, in order
+//   brick_x     the brick of each row; constants count on from the bricks
 //
-// On a GPU a portion has eight threads: each adds to those voxels whose three coordinates are odd or even as its number
-// says. A sample has one voxel for each of them.
+// On a GPU several threads take a portion together. Each looks up one entry, and one of an entry's samples, and then
+// all take these one by one. A thread adds to those voxels whose coordinates are odd or even as its number says (a
+// sample has one of each kind), and one channel in `channels`.
 template <class T>
 struct SpreadGradient {
 #ifdef __CUDACC__
-  static constexpr int kThreads = 8;  // of a portion
+  static constexpr int kCorners = 8;  // threads for the voxels of a sample
+  static constexpr int kBlocksPerSM = sizeof(T) == 4 ? 8 : 5;
 #else
-  static constexpr int kThreads = 1;
+  static constexpr int kCorners = 1;
   static constexpr int64_t kChunkSize = 4;  // see for_each.h
 #endif
   FindSamples<T> find;
   int64_t samples, entries, portions, rows;
+  int32_t channels;
   GV_GRADIENT(GV_TYPED_VIEW)
   T *grad_bzyxc = nullptr, *grad_tnc = nullptr, *row_xn = nullptr;
 
+  // `channels` where voxels have so many numbers: the threads of a portion are at most a warp.
+  static int32_t channels_of(int32_t width) { return kCorners == 1 || width == 1 ? 1 : width == 2 ? 2 : 4; }
+  GV_HD int32_t threads() const { return kCorners * channels; }
+
   struct Entry {
-    int64_t first = 0, end = 0;  // samples
-    typename FindSamples<T>::Source source;
-    bool is_coarse = false;
+    int64_t first = 0;  // sample
+    int32_t length = 0;
+    int32_t is_coarse = 0;
+    typename FindSamples<T>::Line line;
+    Spot<T> spot;
+  };
+  struct Sample {
+    EightVoxels<T> corners;
+    T share;  // of the node in its value
   };
   // An entry without samples if something it refers to does not exist.
-  GV_HD Entry entry(int64_t e) const {
+  GV_HD Entry entry_at(int64_t e) const {
     Entry found;
     const int64_t first = e < 0 || e >= entries ? -1 : entry_e[e] / 2;
     if (first < 0 || length_e[e] < 0 || first > samples - length_e[e]) return found;
-    found.is_coarse = entry_e[e] % 2 != 0;
-    found.source = find(segment_e[e], !found.is_coarse, found.is_coarse);
-    found.first = found.end = first;
-    if (found.source.valid && (found.source.mixed || !found.is_coarse)) found.end += length_e[e];
+    found.first = first;
+    found.is_coarse = static_cast<int32_t>(entry_e[e] % 2);
+    const auto source = find(segment_e[e], found.is_coarse == 0, found.is_coarse != 0);
+    found.line = source.line;
+    found.spot = source.first;
+    if (found.line.valid && (found.line.mixed || found.is_coarse == 0)) found.length = length_e[e];
     return found;
   }
-  // The gradient of a spot's brick, or of its constants.
-  GV_HD T* gradient(const Spot<T>& spot) const {
-    return spot.brick < 0 ? grad_tnc + static_cast<int64_t>(spot.node) * find.width
-                          : grad_bzyxc + spot.brick * find.numbers();
+  GV_HD Sample sample_at(const Entry& entry, int64_t number) const {
+    const T t = entry.line.middle(find.number_k[entry.first + number]);
+    const T weight = entry.line.mixed ? entry.line.weight(t) : 0;
+    return {EightVoxels<T>(entry.spot.at(t), find.side), entry.is_coarse != 0 ? weight : 1 - weight};
+  }
+  // The value that the thread `from` of the portion has.
+  template <class Value>
+  GV_HD Value of_thread(const Value& value, [[maybe_unused]] int32_t from) const {
+#ifdef __CUDA_ARCH__
+    static_assert(sizeof(Value) % sizeof(uint32_t) == 0 && std::is_trivially_copyable_v<Value>);
+    const int32_t size = threads(), lowest = threadIdx.x % 32 / size * size;
+    const unsigned portion = (~0u >> (32 - size)) << lowest;
+    uint32_t words[sizeof(Value) / sizeof(uint32_t)];
+    memcpy(words, &value, sizeof(value));
+#pragma unroll
+    for (uint32_t& word : words) word = __shfl_sync(portion, word, from, size);
+    Value out = value;
+    memcpy(&out, words, sizeof(out));
+    return out;
+#else
+    return value;
+#endif
   }
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t portion = index / kThreads, row = row_p[portion];
-    for (int64_t e = larger(begin_p[portion], int64_t{0}); e < smaller(begin_p[portion + 1], entries); ++e) {
-      const Entry found = entry(e);
-      const Spot<T>& spot = found.source.first;
-      T* sum = row >= 0 && row < rows ? row_xn + row * find.numbers() : gradient(spot);
-      int32_t next = found.first < found.end ? find.number_k[found.first] : 0;
-      for (int64_t k = found.first; k < found.end; ++k) {
-        const T t = found.source.middle(next);
-        next = k + 1 < found.end ? find.number_k[k + 1] : 0;  // read early: GPUs wait long for memory
-        const T weight = found.source.mixed ? found.source.weight(t) : 0;
-        add(spot, t, found.is_coarse ? weight : 1 - weight, grad_kc + k * find.width, sum, index % kThreads);
+    const int64_t portion = index / threads(), end = smaller(begin_p[portion + 1], entries), row = row_p[portion];
+    const auto thread = static_cast<int32_t>(index % threads());
+    for (int64_t e = larger(begin_p[portion], int64_t{0}); e < end; e += threads()) {
+      const Entry own = e + thread < end ? entry_at(e + thread) : Entry{};
+      GV_NO_UNROLL
+      for (int32_t from = 0; from < threads(); ++from) {
+        const Entry entry = of_thread(own, from);
+        const bool has_row = row >= 0 && row < rows;
+        add(entry, has_row ? row_xn + row * find.numbers() : gradient(entry.spot.brick, entry.spot.node), thread);
       }
     }
   }
-  GV_HD void add(const Spot<T>& spot, T t, T share, const T* grad_c, T* sum, int32_t thread) const {
-    const int32_t width = find.width;
-    if (spot.brick < 0) {
-      for (int32_t c = 0; c < width && thread == 0; ++c) sum[c] = sum[c] + share * grad_c[c];
+  // Adds the samples of an entry to what begins at `sum`.
+  GV_HD void add(const Entry& entry, T* sum, int32_t thread) const {
+    for (int64_t begin = 0; begin < entry.length; begin += threads()) {
+      const auto count = static_cast<int32_t>(smaller<int64_t>(entry.length - begin, threads()));
+      const Sample own = sample_at(entry, begin + smaller(thread, count - 1));
+      for (int32_t from = 0; from < count; ++from) {
+        const T* grad_c = grad_kc + (entry.first + begin + from) * find.width;
+        add(of_thread(own, from), entry.spot.brick < 0, grad_c, sum, thread);
+      }
+    }
+  }
+  GV_HD void add(const Sample& sample, bool is_constant, const T* grad_c, T* sum, int32_t thread) const {
+    const int32_t corner = thread % kCorners, channel = thread / kCorners;
+    if (is_constant) {
+      if (corner == 0) add(sample.share, grad_c, sum, channel);
       return;
     }
-    const EightVoxels<T> corners(spot.at(t), find.side);
-    for (int i = 0; i < 8 / kThreads; ++i) {
-      T corner_share = share;
-      int64_t voxel = 0, stride = width;
+    for (int i = 0; i < 8 / kCorners; ++i) {
+      T share = sample.share;
+      int32_t voxel = 0, stride = find.width;
       for (int axis = 0; axis < 3; ++axis) {
-        const int32_t cell = corners.cell[axis];
-        const int upper = (kThreads == 1 ? i >> axis : thread >> axis ^ cell) & 1;
-        corner_share = corner_share * (upper != 0 ? corners.weight[axis] : 1 - corners.weight[axis]);
+        const int32_t cell = sample.corners.cell[axis];
+        const int upper = (kCorners == 1 ? i >> axis : corner >> axis ^ cell) & 1;
+        share = share * (upper != 0 ? sample.corners.weight[axis] : 1 - sample.corners.weight[axis]);
         voxel += (cell + upper) * stride;
         stride *= find.side;
       }
-      for (int32_t c = 0; c < width; ++c) sum[voxel + c] = sum[voxel + c] + corner_share * grad_c[c];
+      add(share, grad_c, sum + voxel, channel);
     }
+  }
+  GV_HD void add(T share, const T* grad_c, T* sum_c, int32_t channel) const {
+    for (int32_t c = channel; c < find.width; c += channels) sum_c[c] = sum_c[c] + share * grad_c[c];
+  }
+  // The gradient of a brick, or, if there is none, of a node's constants.
+  GV_HD T* gradient(int32_t brick, int32_t node) const {
+    return brick < 0 ? grad_tnc + static_cast<int64_t>(node) * find.width : grad_bzyxc + brick * find.numbers();
   }
 };
 
 // Adds each brick's rows to its gradient, in order. Index: a number of a row; that of a brick's first row does it.
 template <class T>
 struct AddRows {
+  static constexpr int kAhead = 8;  // rows that are read together: GPUs wait long for memory
   SpreadGradient<T> spread;
 
   GV_HD void operator()(int64_t index) const {
-    const int64_t numbers = spread.find.numbers(), number = index % numbers;
-    int64_t row = index / numbers;
-    const int64_t portion = spread.added_x[row];
-    if (portion < 0 || portion >= spread.portions || (row > 0 && spread.added_x[row - 1] == portion - 1)) return;
-    const auto found = spread.entry(spread.begin_p[portion]);
-    if (found.first >= found.end || (found.source.first.brick < 0 && number >= spread.find.width)) return;
-    T* sum = spread.gradient(found.source.first) + number;
+    const int64_t numbers = spread.find.numbers(), number = index % numbers, bricks = spread.find.walk.tree.bricks;
+    const int64_t first = index / numbers, brick = spread.brick_x[first];
+    const bool is_constant = brick >= bricks;
+    if (first > 0 && spread.brick_x[first - 1] == brick) return;
+    if (brick < 0 || brick >= bricks + spread.find.nodes || (is_constant && number >= spread.find.width)) return;
+    const auto node = static_cast<int32_t>(brick - bricks);
+    T* sum = spread.gradient(is_constant ? kAbsent : static_cast<int32_t>(brick), node) + number;
     T total = *sum;
-    do {
-      total = total + spread.row_xn[row * numbers + number];
-      ++row;
-    } while (row < spread.rows && spread.added_x[row] == spread.added_x[row - 1] + 1);
+    for (int64_t row = first; row < spread.rows && spread.brick_x[row] == brick; row += kAhead) {
+      T more[kAhead];
+      bool is_same[kAhead];
+      for (int i = 0; i < kAhead; ++i) {
+        const int64_t ahead = smaller(row + i, spread.rows - 1);
+        more[i] = spread.row_xn[ahead * numbers + number];
+        is_same[i] = row + i < spread.rows && spread.brick_x[ahead] == brick;
+      }
+      for (int i = 0; i < kAhead; ++i) total = is_same[i] ? total + more[i] : total;
+    }
     *sum = total;
   }
 };
