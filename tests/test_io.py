@@ -222,7 +222,11 @@ def test_fits_with_nan(tmp_path):
     [
         ("a_5x4x3_int16.raw", grid().tobytes()[:-1], "takes 120 bytes, the file has 119"),
         ("a_5x4x3_int16.raw", grid().tobytes() + b"x", "takes 120 bytes, the file has 121"),
-        ("a_5x4x3_int16.raw.gz", gzip.compress(grid().tobytes(), mtime=0)[:-9], "can't be read as RAW"),
+        (
+            "a_5x4x3_int16.raw.gz",
+            gzip.compress(grid().tobytes(), mtime=0)[:-9],
+            "can't be read as RAW",
+        ),
         (
             "a_5x4x3_int16.raw.gz",
             gzip.compress(grid().tobytes() * 2, mtime=0),
