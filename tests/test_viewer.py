@@ -218,10 +218,8 @@ class Broken(gv.Producer):
     def fill(self, nodes):
         if not self.alive:
             raise OSError("the disk is gone")
-        return {
-            "value": torch.ones(*nodes.positions.shape[:-1], 1)
-            * nodes.depth[:, None, None, None, None]
-        }
+        depth = nodes.depth[:, None, None, None, None].float()
+        return {"value": depth.expand(*nodes.positions.shape[:-1], 1)}
 
 
 def test_a_scene_that_dies_is_told_and_the_picture_goes_on():
