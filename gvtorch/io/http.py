@@ -247,19 +247,23 @@ class TimedResponse(http.client.HTTPResponse):
 
     def __init__(self, *args: Any, deadline: float, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.deadline = deadline
-        self.fp = io.BufferedReader(_TimedStream(self, self.fp.detach()))
+        self._timed = _TimedStream(self.fp.detach(), deadline)
+        self.fp = io.BufferedReader(self._timed)
+
+    def read_until(self, deadline: float) -> None:
+        """Sets another deadline."""
+        self._timed.deadline = deadline
 
 
 class _TimedStream(io.RawIOBase):
-    def __init__(self, response: TimedResponse, stream: io.RawIOBase) -> None:
-        self._response, self._stream = response, stream
+    def __init__(self, stream: io.RawIOBase, deadline: float) -> None:
+        self._stream, self.deadline = stream, deadline
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any) -> int | None:
-        if time.monotonic() > self._response.deadline:
+        if time.monotonic() > self.deadline:
             raise TimeoutError("the server sends hardly anything")
         return self._stream.readinto(buffer)
 

@@ -239,7 +239,7 @@ def _read_parts(
     with closing(stream):
         while True:
             if response is not None:
-                response.deadline = time.monotonic() + _PART_SECONDS
+                response.read_until(time.monotonic() + _PART_SECONDS)
             try:
                 part = stream.read(_PART_BYTES)
             except Exception as error:  # http.client and fsspec have exceptions of their own
