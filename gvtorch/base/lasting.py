@@ -24,7 +24,7 @@ def lasting(function: Function) -> Function:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        # Frames call this often, and seldom in any mode.
+        # Each look costs a frame time; most calls are in no mode at all.
         inference, transform = torch.is_inference_mode_enabled(), in_transform()
         if not (inference or transform or torch._C._is_any_autocast_enabled()):
             return function(*args, **kwargs)

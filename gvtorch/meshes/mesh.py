@@ -49,8 +49,8 @@ class Mesh:
     """Triangles, with colours and texture coordinates for each of their corners.
 
     Arrays of these dtypes are not copied, so they must not be changed afterwards. Raises ValueError
-    if a field has the wrong shape, an index is out of range, a position is not finite, or there is
-    no triangle.
+    if a field has the wrong shape, an index is out of range, a position or uv is not finite, a
+    colour is not finite light >= 0 with an opacity in [0, 1], or there is no triangle.
     """
 
     vertices: np.ndarray  # (v, 3) float64, world units, x y z

@@ -145,10 +145,12 @@ class Fly:
     def _warn_of_older_pictures(self, frames: int) -> None:
         """Warns of pictures that an earlier, longer flight left in the folder."""
         numbers = (re.fullmatch(r"(\d{4,})\.png", name) for name in os.listdir(self.output))
-        older = [match[0] for match in numbers if match is not None and int(match[1]) >= frames]
+        older = [int(match[1]) for match in numbers if match is not None]
+        older = [number for number in older if number >= frames]
         if older:
+            first = f"{min(older):04d}.png"
             warnings.warn(
-                f"{self.output}: holds older pictures as well: {min(older)}, {len(older)} in all",
+                f"{self.output}: holds older pictures as well: {first}, {len(older)} in all",
                 stacklevel=2,
             )
 
