@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -188,6 +189,26 @@ def test_no_image_of_colmap_is_lost(tmp_path, second):
         assert list(gv.read_cameras(tmp_path)) == ["a.jpg", second]
 
 
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"k6": 0.1}, "distortion of model PINHOLE is not read (k6)"),
+        ({"is_fisheye": True, "k1": 0.1, "p2": 0.1}, "OPENCV_FISHEYE is not read (p2): undistort"),
+        ({"w": 40.5}, "frame 0: w must be an int >= 1, got 40.5"),
+        ({"h": "80"}, "frame 0: h must be an int >= 1, got '80'"),
+        ({"h": -80}, "frame 0: h must be an int >= 1, got -80"),
+    ],
+)
+def test_lenses_that_no_camera_has(tmp_path, fields, message):
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    content = {"w": 100.0, "h": 80, "fl_x": 60, "frames": [frame]}
+    (tmp_path / "t.json").write_text(json.dumps(content))
+    assert gv.read_cameras(tmp_path / "t.json")["a"].width == 100, "some programs write floats"
+    (tmp_path / "t.json").write_text(json.dumps(content | fields))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        gv.read_cameras(tmp_path / "t.json")
+
+
 def test_damaged_and_unknown_files_are_one_line(tmp_path):
     (tmp_path / "cameras.txt").write_text("1 OPENCV 640 480 500 500 320 240 0.1 0 0 0\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 5 1 a.jpg\n\n")
@@ -210,7 +231,7 @@ def test_damaged_and_unknown_files_are_one_line(tmp_path):
     (tmp_path / "empty").mkdir()
     gv.write_cameras(tmp_path / "f.pvcc", gv.Camera.look_at(EYE, TARGET))
     for name, message in (
-        (".", "a lens of model OPENCV with distortion is not read"),
+        (".", "distortion of model OPENCV is not read (k1): undistort first"),
         ("a.json", "frame 0: pose must be (4, 4) numbers"),
         ("b.json", "has no cameras"),
         ("keys.json", "keys.json: must be an object with frames"),

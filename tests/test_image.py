@@ -340,6 +340,14 @@ def test_a_missing_library_is_named_and_leaves_no_file(tmp_path, monkeypatch, en
     assert not list(tmp_path.iterdir())
 
 
+def test_a_folder_is_not_replaced(tmp_path):
+    """The message names the picture, not the file that was to take its place."""
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(OSError, match=r"can't be written: Is a directory: '.*/a\.png'"):
+        gv.write_image(tmp_path / "a.png", np.zeros((2, 2, 4), np.float32))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
 def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     good = made(torch.rand(4, 4, 3))

@@ -196,6 +196,17 @@ def test_columns_of_another_length_are_told(tmp_path):
         assert gv.read_points(tmp_path / "a.npz").radius is None
 
 
+def test_that_only_centres_of_gaussians_are_read_is_told(tmp_path):
+    names = ["x", "y", "z", "f_dc_0", "opacity", "scale_0", "rot_0"]
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 9\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    rows = np.random.default_rng(0).random((9, len(names)), np.float32)
+    (tmp_path / "a.ply").write_bytes(head.encode() + rows.tobytes())
+    with pytest.warns(UserWarning, match="of 3D Gaussians only the centres are read"):
+        points = gv.read_points(tmp_path / "a.ply")
+    assert np.array_equal(points.positions, rows[:, :3]) and points.radius is None
+
+
 def test_no_pickle_is_loaded_and_nan_is_told(tmp_path):
     path = tmp_path / "a.npz"
     np.savez(path, position=PLACE, value=np.array([{}] * COUNT))

@@ -20,7 +20,7 @@ from helpers.viewer import FUNCTION, TIMEOUT, Page, bright_ball, pixels, split
 from yarl import URL
 
 import gvtorch as gv
-from gvtorch.viewer.server import Server, page_files
+from gvtorch.viewer.server import Server, _Outbox, page_files
 from gvtorch.viewer.view import new_session
 
 pytestmark = pytest.mark.backend("cpp")
@@ -190,6 +190,26 @@ def test_a_rude_page_harms_nobody(server, session):
             break
         deadline.wait(0.05)
     assert not session.clients
+
+
+def test_a_page_that_reads_too_slowly_is_given_up():
+    """By bytes: a thousand small messages may wait, and one file of any size."""
+
+    async def run():
+        outbox, picture = _Outbox(), bytes(2**20)
+        for _ in range(3):  # also once there is room again
+            for number in range(1000):
+                outbox.put(f"{number}")
+            assert [await outbox.get() for _ in range(1000)] == [f"{n}" for n in range(1000)]
+            outbox.put(bytes(2**27))
+            assert len(await outbox.get()) == 2**27
+        for number in range(100):
+            outbox.put(picture if number < 64 else "late")
+        assert [await outbox.get() for _ in range(65)] == [picture] * 64 + [None]
+        outbox.put("later")
+        assert outbox._messages.empty()
+
+    asyncio.run(run())
 
 
 def test_view_serves_and_ends(tmp_path):

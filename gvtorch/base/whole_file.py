@@ -50,10 +50,10 @@ def whole_file(path: Path) -> Iterator[Path]:
         with name_in_errors(path, temp_path, draft):
             os.close(handle)
             yield Path(draft)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temp_path, 0o666 & ~mask)
-        os.replace(temp_path, path)
+            mask = os.umask(0)
+            os.umask(mask)
+            os.chmod(temp_path, 0o666 & ~mask)
+            os.replace(temp_path, path)
     finally:
         Path(temp_path).unlink(missing_ok=True)
 

@@ -37,7 +37,7 @@ from .poses import Coordinates
 _FLIP = torch.tensor([1.0, -1, -1, 1], dtype=torch.float64, device="cpu").diag()  # y down to up
 _PVCC_VECTORS = ("CameraPosition", "CameraFocalPoint", "CameraViewUp", "CenterOfRotation")
 _PVCC_NUMBERS = ("CameraViewAngle", "CameraParallelScale", "CameraParallelProjection")
-_DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")  # the first four, if a fisheye's
 _FISHEYE = "OPENCV_FISHEYE"
 #: Parameters of COLMAP's models; distorted pinholes are read only if all their coefficients are 0.
 _COLMAP_PARAMETERS = {
@@ -211,9 +211,10 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
         pose = check.reals(f"frame {number}", "pose", fields["transform_matrix"], (4, 4)) @ _FLIP
         view = torch.eye(4, dtype=torch.float64, device="cpu")
         view[:3, :3], view[:3, 3] = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
-        x, y = (int(fields.get(k) or size or 0) for k, size in (("w", width), ("h", height)))
+        x, y = (fields.get(k) or size for k, size in (("w", width), ("h", height)))
         if not x or not y:
             raise ValueError("does not give the size of the pictures: give width and height")
+        x, y = (_pixels(number, name, size) for name, size in (("w", x), ("h", y)))
         lens = {**fields, "fx": _focal_length(fields, "x", x), "fy": _focal_length(fields, "y", y)}
         if lens["fx"] is None:
             raise KeyError("camera_angle_x")
@@ -224,6 +225,12 @@ def _read_transforms(path: Path, width: int | None, height: int | None) -> dict[
         model = _FISHEYE if is_fisheye else fields.get("camera_model", "PINHOLE")
         cameras[name] = _camera_of_lens(model, view, lens, (x, y))
     return cameras
+
+
+def _pixels(number: int, name: str, size: Any) -> int:
+    """Returns a side of a frame's picture, which some programs write as 800.0."""
+    whole = int(size) if isinstance(size, float) and size.is_integer() else size
+    return check.integer(f"frame {number}", name, whole, low=1)
 
 
 def _focal_length(fields: Mapping[str, Any], axis: str, size: int) -> Any:
@@ -243,12 +250,15 @@ def _camera_of_lens(
     fy = fx if lens.get("fy") is None else lens["fy"]
     cx, cy = lens.get("cx", size[0] / 2), lens.get("cy", size[1] / 2)
     Ks = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64, device="cpu")
-    distortion = [float(lens.get(name) or 0) for name in _DISTORTIONS]
-    if not any(distortion):
+    distortion = {name: float(lens.get(name) or 0) for name in _DISTORTIONS}
+    readable = _DISTORTIONS[:4] if model == _FISHEYE else ()
+    if unread := [name for name, value in distortion.items() if value and name not in readable]:
+        found = f"{model} is not read ({', '.join(unread)})"
+        raise ValueError(f"distortion of model {found}: undistort first")
+    if not any(distortion.values()):
         return Camera(view, Ks, *size, model="fisheye" if model == _FISHEYE else "pinhole")
-    if model != _FISHEYE:
-        raise ValueError(f"a lens of model {model} with distortion is not read: undistort first")
-    return Camera(view, Ks, *size, model="fisheye", radial_coeffs=distortion[:4])
+    coefficients = [distortion[name] for name in readable]
+    return Camera(view, Ks, *size, model="fisheye", radial_coeffs=coefficients)
 
 
 def _parameters_of(model: str) -> tuple[str, ...]:

@@ -36,6 +36,7 @@ _USUAL: dict[str, tuple[tuple[str, ...], tuple[str, ...], tuple[int, ...]]] = {
     "values": ((), _VALUE_NAMES, (1, 2, 3, 4)),
     "radius": ((), ("radius", "radii", "smoothing"), (1,)),
 }
+_SPLAT_NAMES = {"f_dc_0", "scale_0", "rot_0", "opacity"}  # of 3D Gaussian splatting
 _FITS_TYPES = tuple("BIJKEDF")  # codes of columns with a number or an array of numbers per row
 _MAX_HEADER_BYTES = 65536
 
@@ -143,6 +144,9 @@ def _read_columns(path: Path) -> dict[str, np.ndarray]:
     if other_lengths:
         message = f"{path}: not read, since others have {count} rows: {', '.join(other_lengths)}"
         warnings.warn(message, stacklevel=4)
+    if columns.keys() >= _SPLAT_NAMES:
+        message = "of 3D Gaussians only the centres are read, as points: no size, colour or opacity"
+        warnings.warn(f"{path}: {message}", stacklevel=4)
     return {n: column for n, column in columns.items() if len(column) == count and column.ndim <= 2}
 
 

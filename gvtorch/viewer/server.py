@@ -43,7 +43,8 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",
 }
-_MAX_QUEUED = 4096  # messages that may wait for a page before it is disconnected
+_MAX_QUEUED = 2**26  # bytes that may wait for a page, if they are not of one message
+_MIN_COUNTED = 2**14  # bytes that the smallest message counts as: what holds it takes memory too
 _LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
 
 
@@ -63,6 +64,29 @@ def _is_worth_logging(record: logging.LogRecord) -> bool:
     """Returns whether a log record of aiohttp is worth showing: not one of a malformed request."""
     error = record.exc_info[1] if record.exc_info else None
     return type(error).__module__ != "aiohttp.http_exceptions"
+
+
+class _Outbox:
+    """The messages that wait to be sent to a page; one that does not keep up gets no more."""
+
+    def __init__(self) -> None:
+        self._messages: asyncio.Queue[str | bytes | None] = asyncio.Queue()
+        self._queued = 0  # bytes
+        self._given_up = False
+
+    def put(self, data: str | bytes) -> None:
+        if self._given_up:
+            return
+        size = max(len(data), _MIN_COUNTED)
+        self._given_up = self._queued > 0 and self._queued + size > _MAX_QUEUED
+        self._queued += size
+        self._messages.put_nowait(None if self._given_up else data)
+
+    async def get(self) -> str | bytes | None:
+        """Waits for a message; returns None once the page is to be disconnected."""
+        data = await self._messages.get()
+        self._queued -= max(len(data), _MIN_COUNTED) if data is not None else 0
+        return data
 
 
 class Server:
@@ -212,21 +236,15 @@ class Server:
         ws = web.WebSocketResponse(max_msg_size=MAX_MESSAGE_BYTES, heartbeat=30, compress=False)
         await ws.prepare(request)
         self._sockets.add(ws)
-        queue: asyncio.Queue[str | bytes | None] = asyncio.Queue()
+        outbox = _Outbox()
         loop = asyncio.get_running_loop()
-
-        def enqueue(data: str | bytes) -> None:
-            if queue.qsize() < _MAX_QUEUED:
-                queue.put_nowait(data)
-            elif queue.qsize() == _MAX_QUEUED:
-                queue.put_nowait(None)  # the page does not keep up
 
         def send(data: str | bytes) -> None:
             with contextlib.suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(enqueue, data)
+                loop.call_soon_threadsafe(outbox.put, data)
 
         async def send_queued() -> None:
-            while (data := await queue.get()) is not None:
+            while (data := await outbox.get()) is not None:
                 await (ws.send_str(data) if isinstance(data, str) else ws.send_bytes(data))
             await ws.close(code=1008, message=b"too slow")
 

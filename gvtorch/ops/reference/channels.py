@@ -18,7 +18,7 @@ from .tree import ChannelBricks
 class AllNumbers(ChannelBricks):
     """All numbers of a channel; smallest and largest values are (r, c)."""
 
-    def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    def value_range(self, node: Tensor | slice, real: torch.dtype) -> tuple[Tensor, Tensor]:
         low, high = self.range_n2c[node].to(real).unbind(1)
         return low, high
 
@@ -76,7 +76,7 @@ class ChannelMix(Lit):
         super().__post_init__()
         self.table = ChannelTable(self.transfer)
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    def transparent(self, low: Tensor, high: Tensor) -> Tensor:
         return self.table.transparent(low, high)
 
     def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:

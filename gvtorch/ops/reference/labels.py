@@ -92,7 +92,7 @@ class Labels(Lit):
     channel: LabelBricks
     feature_count = 1
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    def transparent(self, low: Tensor, high: Tensor) -> Tensor:
         first, last = self.row_of(low), self.row_of(high)
         before = self.transfer.opaque_m[(first - 1).clamp(min=0)]
         return self.transfer.opaque_m[last] == torch.where(first > 0, before, 0)

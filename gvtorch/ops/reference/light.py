@@ -254,8 +254,8 @@ class ShadowVisitor(Visitor):
     stop_clear: Tensor  # (): cones end at this transmittance
     each_interval: bool  # regions of one value are not taken in one step
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        return self.shader.hides(ray_index, low, high)
+    def hides(self, ray_index: Tensor, node: Tensor) -> Tensor:
+        return self.shader.hides(ray_index, node)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
         if self.each_interval:  # 1 - alpha of a long interval would round to 0

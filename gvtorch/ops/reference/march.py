@@ -15,6 +15,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Any, Self
 
 import torch
@@ -238,8 +239,18 @@ class Visitor(ABC):
     channel: ChannelBricks
     sees_empty = False  # whether EMPTY nodes are sampled, too
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        """Returns (k,) bool: no value from low to high (k,) affects the rays `ray_index` (k,)."""
+    @cached_property
+    def transparent_n(self) -> Tensor:
+        """(n,) bool, for each node: no value in it or below it affects a ray."""
+        real = self.transfer.table_lm4.dtype
+        return self.transparent(*self.channel.value_range(slice(None), real))
+
+    def hides(self, ray_index: Tensor, node: Tensor) -> Tensor:
+        """Returns (k,) bool: nothing in nodes (k,) or below affects the rays `ray_index` (k,)."""
+        return self.transparent_n[node]
+
+    def transparent(self, low: Tensor, high: Tensor) -> Tensor:
+        """Returns (n,) bool: no value from low to high (n,) affects a ray."""
         return self.transfer.transparent(low, high)
 
     def same(self, fine: Tensor, coarse: Tensor) -> Tensor:
@@ -309,10 +320,7 @@ class Walk:
         wanted = tree.levels.wanted(cone)
         voxel, voxel_above = tree.levels.voxels(wanted)
 
-        def hides(node: Tensor) -> Tensor:
-            return visitor.hides(ray_index, *self.channel.value_range(node, t.dtype))
-
-        descent = tree.descend(finest, wanted, hides)
+        descent = tree.descend(finest, wanted, partial(visitor.hides, ray_index))
         fits = voxel <= cone
         blends = fits & (wanted > 0)
         only_fine = ~blends | (descent.coarse < 0)

@@ -85,13 +85,12 @@ class Isosurface(Lit):
         self.is_hit = torch.zeros_like(zeros, dtype=torch.bool)
         self.last_value, self.last_end, self.share = zeros, zeros - INF, zeros
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
-        level, filled, hides = self.level, self.filled, torch.zeros_like(self.is_hit[ray_index])
-        if filled >= 0:
-            hides = hides | (a_little_above(high) < level)
-        if filled <= 0:
-            hides = hides | (a_little_below(low) >= level)
-        return hides & ~self.is_hit[ray_index]
+    def hides(self, ray_index: Tensor, node: Tensor) -> Tensor:
+        return super().hides(ray_index, node) & ~self.is_hit[ray_index]
+
+    def transparent(self, low: Tensor, high: Tensor) -> Tensor:
+        below, above = a_little_above(high) < self.level, a_little_below(low) >= self.level
+        return (below & (self.filled >= 0)) | (above & (self.filled <= 0))
 
     def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:
         level = self.level
@@ -174,8 +173,9 @@ class Projection(Lit):
         self.kind = self.light.parameters.own_as(ProjectionNumbers).kind
         self.value, self.length, self.value_t = (torch.zeros_like(self.sum.clear) for _ in range(3))
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    def hides(self, ray_index: Tensor, node: Tensor) -> Tensor:
         kind, value = self.kind, self.value[ray_index]
+        low, high = self.channel.value_range(node, value.dtype)
         no_gain = ((kind == ProjectionKind.MAXIMUM) & (a_little_above(high) <= value)) | (
             (kind == ProjectionKind.MINIMUM) & (a_little_below(low) >= value)
         )

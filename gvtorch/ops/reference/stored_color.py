@@ -22,7 +22,7 @@ from .tree import ChannelBricks, Holder
 class ColorBricks(ChannelBricks):
     """A channel of red, green, blue, opacity, once or for six directions; ranges are opacity's."""
 
-    def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    def value_range(self, node: Tensor | slice, real: torch.dtype) -> tuple[Tensor, Tensor]:
         low, high = self.range_n2c[node, :, 3::COLOR_WIDTH].to(real).unbind(1)
         return low.amin(1), high.amax(1)
 
@@ -46,7 +46,7 @@ class StoredColor(Lit):
     def numbers(self) -> StoredColorNumbers:
         return self.light.parameters.own_as(StoredColorNumbers)
 
-    def hides(self, ray_index: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    def transparent(self, low: Tensor, high: Tensor) -> Tensor:
         return ~(a_little_above(high) > 0)
 
     def add(self, interval: Interval, probe: Probe, mask: Tensor) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Self
@@ -58,7 +59,7 @@ class Levels:
         self, node: Tensor, brick: Tensor, depth: Tensor, finest: Tensor, beam: Beam
     ) -> Holder:
         """Returns nodes (r,), with brick words, at a depth, and where the rays lie in them."""
-        corner, _ = self.corners(finest, depth)
+        corner = self.cells(finest, depth) * self.size_d[depth, None]
         scale = self.scale_d[depth]
         start = (beam.exact_origin - corner).to(scale) * scale[:, None] + (self.border - 0.5)
         return Holder(node, brick, depth, scale, start, beam.direction * scale[:, None])
@@ -101,40 +102,44 @@ class Tree:
         self.arguments, self.levels = args, Levels(args, args.table_lm4.dtype)
         # A word that names a tile or slot beyond the pool counts as absent.
         child, brick = args.child_tn, args.brick_tn
-        self.child_n = torch.where(child < len(child), child, ABSENT).view(-1)
-        self.brick_n = torch.where(brick < len(args.bricks_bzyxc), brick, ABSENT).view(-1)
+        self.child_n, self.brick_n = (
+            torch.where(word < count, word, ABSENT).view(-1).to(torch.int64)
+            for word, count in ((child, len(child)), (brick, len(args.bricks_bzyxc)))
+        )
         self.request_n, self.per_tile = args.request_tn.view(-1), args.child_tn.shape[1]
 
     def descend(self, finest: Tensor, wanted: Tensor, hides: Callable[[Tensor], Tensor]) -> Descent:
         """Descends to the wanted depth, or as far as tiles exist and are seen; stamps the tiles."""
         args, n = self.arguments, self.levels.branching
-        node, depth = torch.full_like(wanted, args.root), torch.zeros_like(wanted)
+        node, zero = torch.full_like(wanted, args.root), torch.zeros_like(wanted)
         absent = torch.full_like(node, -1)
-        descent = Descent(node, depth, absent, hides(node), absent, depth, absent, depth)
+        descent = Descent(node, zero, absent, hides(node), absent, zero, absent, zero)
         active = torch.ones_like(node, dtype=torch.bool)
-        while True:
+        for depth in itertools.count():  # of all that go on
+            goes_deeper = wanted > depth
             args.stamp_t[descent.node[active] // self.per_tile] = args.frame_1[0]
             has_data = active & (self.brick_n[descent.node] != ABSENT)
             descent.fine = torch.where(has_data, descent.node, descent.fine)
-            descent.fine_depth = torch.where(has_data, descent.depth, descent.fine_depth)
-            above_wanted = has_data & (descent.depth < wanted)
+            descent.fine_depth = torch.where(has_data, depth, descent.fine_depth)
+            above_wanted = has_data & goes_deeper
             descent.coarse = torch.where(above_wanted, descent.node, descent.coarse)
-            descent.coarse_depth = torch.where(above_wanted, descent.depth, descent.coarse_depth)
+            descent.coarse_depth = torch.where(above_wanted, depth, descent.coarse_depth)
 
-            tile = self.child_n[descent.node].to(torch.int64)
-            active = active & (descent.depth < wanted) & (tile >= 0) & ~descent.hidden
+            tile = self.child_n[descent.node]
+            active = active & goes_deeper & (tile >= 0) & ~descent.hidden
             if not active.any():
-                return descent
-            x, y, z = (self.levels.cells(finest, descent.depth + active) % n).unbind(1)
+                break
+            x, y, z = (finest // n ** (args.max_depth - depth - 1) % n).unbind(1)
             child = tile * self.per_tile + (z * n + y) * n + x
             descent.parent = torch.where(active, descent.node, descent.parent)
             descent.node = torch.where(active, child, descent.node)
-            descent.depth = torch.where(active, descent.depth + 1, descent.depth)
+            descent.depth = torch.where(active, depth + 1, descent.depth)
             descent.hidden = torch.where(active, hides(descent.node), descent.hidden)
+        return descent
 
     def holder(self, node: Tensor, depth: Tensor, finest: Tensor, beam: Beam) -> Holder:
         """Returns nodes (r,), or -1, at a depth, and where the rays lie in them."""
-        brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)].to(torch.int64), ABSENT)
+        brick = torch.where(node >= 0, self.brick_n[node.clamp(min=0)], ABSENT)
         return self.levels.holder(node, brick, depth, finest, beam)
 
     def mark_missing(
@@ -201,7 +206,7 @@ class ChannelBricks:
         constant_nc = constants.flatten(0, 1)
         return replace(self, bricks_bzyxc=bricks, constant_nc=constant_nc, component=component)
 
-    def value_range(self, node: Tensor, real: torch.dtype) -> tuple[Tensor, Tensor]:
+    def value_range(self, node: Tensor | slice, real: torch.dtype) -> tuple[Tensor, Tensor]:
         """Returns (r,) smallest and largest values in reach of bricks of the nodes and below."""
         low, high = self.range_n2c[node, :, self.component].to(real).unbind(1)
         return low, high
