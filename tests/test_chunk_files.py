@@ -164,13 +164,13 @@ def test_what_is_no_file_of_a_chunk_is_told(stored, kind):
             out.truncate(1 << 33)
     reason = "takes 8589934592 bytes, more than the" if kind == "long" else "is not a regular file"
     with pytest.raises(http.Endless, match=f"{file.relative_to(stored)}: {reason}"):
-        read(array).result(timeout=5)
+        read(array).result(timeout=60)
     assert not read(array[box((2, 2, 1))]).result().any()
     head = next(stored / head for head in METADATA_FILES if (stored / head).exists())
     head.unlink()
     file.rename(head)
     with pytest.raises(http.Endless, match=f"{head.name}: {reason}"):
-        opened_at(kvstore(stored), {"driver": "n5"}).result(timeout=5)
+        opened_at(kvstore(stored), {"driver": "n5"}).result(timeout=60)
 
 
 def test_places_are_known_of_items_that_are_chunks_alone():

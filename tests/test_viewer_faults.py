@@ -247,7 +247,7 @@ def test_a_question_to_a_view_that_closes_is_answered_at_once(session):
 
     def ask() -> None:
         try:
-            session.ask(lambda: None, timeout=5.0)
+            session.ask(lambda: None, timeout=TIMEOUT)
         except Exception as error:
             errors.append(error)
 

@@ -33,7 +33,7 @@ def middle(tab: Tab, axis: str, x: float = 0.5, y: float = 0.5) -> tuple[float, 
 def with_slices(tab: Tab) -> np.ndarray:
     tab.page.get_by_label("Three slices beside").click()
     tab.until("!!app.slices.layout && app.view.head.final")
-    tab.page.wait_for_timeout(300)
+    tab.pause(300)
     return tab.final()
 
 
@@ -51,7 +51,7 @@ def test_slices_are_moved_by_click_drag_and_wheel(tab, viewer):
     tab.page.mouse.move(*middle(tab, "z"))
     for _ in range(4):
         tab.page.mouse.wheel(0, 100)
-        tab.page.wait_for_timeout(30)
+        tab.pause(30)
     tab.until(lambda: viewer.state.slices.position[2] == 15.5)
     tab.until("!app.stateBefore")
     scrolled = tab.final()
@@ -87,7 +87,7 @@ def test_a_double_click_beside_planes_looks_at_what_is_hit(tab):
     tab.page.mouse.dblclick(
         box["x"] + (left + columns.mean()) / ratio, box["y"] + (top + rows.mean()) / ratio
     )
-    tab.page.wait_for_timeout(700)
+    tab.pause(700)
     centre = np.array([0.65, 0.5, 0.4]) * 40 - 0.5
     assert 3 < np.linalg.norm(np.subtract(tab.app("app.camera.target"), centre)) < 10
 
@@ -108,7 +108,7 @@ def test_a_plane_is_moved_and_tilted_by_its_handles(tab, viewer):
     tab.until("app.state.options.clip?.planes.length === 1")
     faced = tab.app("app.state.options.clip.planes[0]")
     tab.drag((200, 330), (330, 330))  # turned, so that the plane is seen from the side
-    tab.page.wait_for_timeout(250)
+    tab.pause(250)
     tab.until(lambda: differs(tab.final(), before) > 60)
     cut = tab.final()
     x, y = handle(tab, "plane")
@@ -234,10 +234,10 @@ def test_node_boxes_are_drawn_over_the_picture(tab):
     assert (ends[:, 0] >= box[0] - 1e-6).all() and (ends[:, 1] <= box[1] + 1e-6).all()
     assert (ends[:, 1] > ends[:, 0]).all() and message["count"] == len(ends)
     tab.drag((340, 210), (400, 230))
-    tab.page.wait_for_timeout(300)
+    tab.pause(300)
     tab.final()
     tab.page.locator(".gv-tick:has-text('nodes') input").uncheck()
-    tab.page.wait_for_timeout(100)
+    tab.pause(100)
     assert strokes(tab) < before + 1000
 
 
@@ -364,7 +364,7 @@ def test_a_file_that_is_no_state_leaves_the_view_as_it_is(tab, viewer, tmp_path)
         chooser.value.set_files(tmp_path / "view.json")
         tab.until(lambda: "nothing" not in note.inner_text())
         tab.until("document.querySelector('.gv-note').classList.contains('gv-bad')")
-    tab.page.wait_for_timeout(300)
+    tab.pause(300)
     assert tab.app("app.camera") == camera
     assert viewer.session.ask(viewer.state.to_json) == before
     assert tab.app("app.state") == {name: before[name] for name in before if name != "camera"}
@@ -474,7 +474,7 @@ def test_every_control_of_every_shader_is_touched(tab, viewer):
         row.select_option(label=name)
         tab.until("!app.stateBefore")
         tab.page.evaluate(TOUCH)
-        tab.page.wait_for_timeout(50)
+        tab.pause(50)
     assert not tab.complaints
     row.select_option(label="Isosurface")
     tab.until("app.state.shader.kind === 'Isosurface'")

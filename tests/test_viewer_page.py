@@ -65,7 +65,7 @@ def test_the_canvas_shows_what_render_makes_of_the_saved_state(tab, tmp_path):
     """A screenshot equals `gvtorch render --state`, except for JPEG's losses."""
     tab.drag(STAGE, (400, 180))
     tab.page.mouse.wheel(0, -200)
-    tab.page.wait_for_timeout(300)
+    tab.pause(300)
     seen = tab.final()
     with tab.page.expect_download() as saved:
         tab.page.get_by_label("Save all that is shown").click()
@@ -87,11 +87,14 @@ def test_hands_turn_pan_zoom_and_fly(tab):
     before, camera = tab.final(), tab.app("app.camera")
 
     def after() -> tuple[np.ndarray, dict]:
-        tab.page.wait_for_timeout(250)
+        tab.pause(250)
         return tab.final(), tab.app("app.camera")
 
     def far(c: dict) -> float:
         return float(np.linalg.norm(np.subtract(c["eye"], c["target"])))
+
+    def away(c: dict) -> np.ndarray:
+        return np.subtract(c["eye"], c["target"]) / far(c)
 
     tab.drag(STAGE, (420, 230))
     turned, there = after()
@@ -110,17 +113,14 @@ def test_hands_turn_pan_zoom_and_fly(tab):
     _, near = after()
     assert far(near) < 0.8 * far(panned) and not np.allclose(near["target"], panned["target"])
     tab.page.keyboard.down("w")
-    tab.page.wait_for_timeout(200)
+    tab.until(lambda: not np.allclose(tab.app("app.camera.eye"), near["eye"]))
     tab.page.keyboard.up("w")
     _, flown = after()
     assert abs(far(flown) - far(near)) < 1e-6 and not np.allclose(flown["eye"], near["eye"])
     tab.page.keyboard.press("f")
     tab.until(lambda: far(tab.app("app.camera")) > 1.3 * far(near))
-    tab.page.keyboard.press("3")  # along +y
-    tab.page.wait_for_timeout(600)
-    _, above = after()
-    away = np.subtract(above["eye"], above["target"])
-    assert np.allclose(away / np.linalg.norm(away), (0, 1, 0), atol=1e-6)
+    tab.page.keyboard.press("3")
+    tab.until(lambda: np.allclose(away(tab.app("app.camera")), (0, 1, 0), atol=1e-6))
     tab.page.keyboard.press("o")
     flat, ortho = after()
     assert ortho["model"] == "ortho" and flat.std() > 5
@@ -130,10 +130,9 @@ def test_a_double_click_looks_at_what_is_hit(tab):
     rows, columns = np.nonzero(tab.final().max(-1) > 150)
     scale = tab.app("app.view.ratio")
     tab.page.mouse.dblclick(columns.mean() / scale, rows.mean() / scale)
-    tab.page.wait_for_timeout(700)
-    target = tab.app("app.camera.target")
+    tab.pause(700)
     centre = np.array([0.65, 0.5, 0.4]) * 40 - 0.5
-    assert 3 < np.linalg.norm(np.subtract(target, centre)) < 10
+    assert 3 < np.linalg.norm(tab.app("app.camera.target") - centre) < 10
     tab.final()
 
 
@@ -208,7 +207,7 @@ def test_every_shader_and_section_has_controls_that_work(tab, viewer):
         )
         kind = name.title().replace(" ", "") if " " in name else name
         tab.until(lambda kind=kind: type(viewer.state.shader).__name__ == kind)
-        tab.page.wait_for_timeout(100)
+        tab.pause(100)
         assert tab.final().std() > 3, name
     tab.page.locator("details:has(> summary:text-is('Shader')) select").first.select_option("Lit")
     tab.until(lambda: type(viewer.state.shader).__name__ == "Lit")
@@ -239,7 +238,7 @@ def test_two_pages_and_one_that_follows(tab, chromium, viewer):
         other.open("Camera")
         other.page.locator("label.gv-row:has-text('follow') select").select_option("page 1")
         tab.drag(STAGE, (410, 240))
-        tab.page.wait_for_timeout(300)
+        tab.pause(300)
         eye = tab.app("app.camera.eye")
         other.until(lambda: np.allclose(other.app("app.camera.eye"), eye))
         other.until(lambda: np.array_equal(other.final(), tab.final()))
@@ -317,8 +316,8 @@ def test_the_notebook_mounts_the_same_page(chromium):
             _MODEL,
             module_text(),
         )
-        for _ in range(600):
-            page.wait_for_timeout(20)
+        for _ in range(6000):
+            page.wait_for_timeout(10)
             for data in [waiting.pop(0) for _ in range(len(waiting))]:
                 raw = None if isinstance(data, str) else base64.b64encode(data).decode()
                 page.evaluate(
@@ -384,7 +383,7 @@ def test_a_connection_that_was_lost_goes_on_where_it_was(tab, viewer):
     tab.open("Camera")
     tab.page.mouse.move(*STAGE)
     tab.page.mouse.wheel(0, -300)
-    tab.page.wait_for_timeout(300)
+    tab.pause(300)
     before, eye = tab.final(), tab.app("app.camera.eye")
     tab.app("app.view.head = null")
     server = viewer.server
@@ -415,7 +414,7 @@ def test_keys_pressed_anew_fly_no_faster(tab):
 
 def test_a_hand_stops_a_gliding_camera(tab):
     tab.app("(app.faceAxis(0, 1), app.moveCamera({ ...app.camera, fov: 20 }, false), null)")
-    tab.page.wait_for_timeout(400)
+    tab.pause(400)
     assert tab.app("app.camera.fov") == 20
     tab.final()
 
@@ -427,7 +426,7 @@ def test_a_number_that_is_deleted_comes_back(tab, viewer):
     tab.until(lambda: viewer.state.develop.exposure == 2)
     field.fill("")
     field.press("Enter")
-    tab.page.wait_for_timeout(200)
+    tab.pause(200)
     assert viewer.state.develop.exposure == 2 and field.input_value() == "2"
 
 
@@ -472,7 +471,7 @@ def test_the_histogram_in_view_is_that_of_the_view(tab):
     tab.page.mouse.move(*STAGE)
     for _ in range(8):  # inside the ball
         tab.page.mouse.wheel(0, -300)
-    tab.page.wait_for_timeout(300)
+    tab.pause(300)
     tab.final()
     tab.until(lambda: tab.app("app.panel.editor.histogram.counts") != before)
 
@@ -541,7 +540,7 @@ def test_keys_work_wherever_the_focus_is(tab, viewer):
     tab.until(lambda: viewer.state.develop.exposure == 0)
     number_of(tab, "exposure").focus()
     tab.page.keyboard.press("Control+z")
-    tab.page.wait_for_timeout(100)
+    tab.pause(100)
     assert tab.app("app.camera.model") == "ortho"
     tab.final()
 
@@ -570,7 +569,7 @@ def test_what_is_too_long_for_a_message_keeps_the_connection(tab):
     number = tab.app("app.number")
     tab.app("app.presets.read('a.json', '\"'.repeat(700000), null)")  # twice as long in JSON
     tab.until("app.note.textContent.includes('read: 1400')")
-    tab.page.wait_for_timeout(700)
+    tab.pause(700)
     assert tab.app("app.number") == number
 
 

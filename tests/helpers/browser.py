@@ -16,12 +16,20 @@ from .viewer import TIMEOUT
 __all__ = ["Tab", "chromium_path", "running_chromium", "why_no_browser"]
 
 
+def slowness() -> float:
+    """How many times longer than usual this machine takes at the moment, from 1 to 10."""
+    start = time.perf_counter()
+    sum(range(200_000))
+    return min(max((time.perf_counter() - start) / 0.004, 1.0), 10.0)
+
+
 class Tab:
     """A page in the browser, its errors and warnings (`complaints`), and its requests."""
 
     def __init__(self, browser: Any, url: str, **options: Any) -> None:
         options = {"viewport": {"width": 1000, "height": 420}, **options}
         self.context = browser.new_context(**options)
+        self.context.set_default_timeout(1e3 * TIMEOUT)
         self.page = self.context.new_page()
         self.complaints: list[str] = []
         self.requests: list[str] = []
@@ -51,6 +59,10 @@ class Tab:
                 return result
             assert time.monotonic() < end, f"it never came: {condition}; {self.complaints}"
             self.page.wait_for_timeout(30)
+
+    def pause(self, milliseconds: float) -> None:
+        """Lets the page do what it does within this time, on a machine that is not busy."""
+        self.page.wait_for_timeout(milliseconds * slowness())
 
     def final(self) -> np.ndarray:
         """Waits for the final picture of all changes so far; returns (h, w, 3) uint8."""
