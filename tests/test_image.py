@@ -344,7 +344,7 @@ def test_a_folder_is_not_replaced(tmp_path):
     """The message names the picture, not the file that was to take its place."""
     (tmp_path / "a.png").mkdir()
     with pytest.raises(OSError, match=r"can't be written: Is a directory: '.*/a\.png'"):
-        gv.write_image(tmp_path / "a.png", np.zeros((2, 2, 4), np.float32))
+        made(torch.rand(4, 4, 3)).save(tmp_path / "a.png")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
 
 

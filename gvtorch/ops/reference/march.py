@@ -163,9 +163,10 @@ class ShadeSum:
         hit = mask & (clear_after < self.hit_clear) & (self.clear >= self.hit_clear)
         if hit.any():
             opaque = ~(transmittance > TINY)
-            fraction = log2_exact(torch.where(hit, self.hit_clear / self.clear, 1.0))
-            fraction = fraction / log2_exact(torch.where(hit & ~opaque, transmittance, 0.5))
-            fraction = torch.where(opaque, 0.0, clamp(fraction, 0, 1))
+            to_hit = torch.where(hit, self.hit_clear / self.clear, 1.0)
+            to_end = torch.where(hit & ~opaque, transmittance, 0.5)
+            halvings, most = log2_exact(torch.stack((to_hit, to_end)))
+            fraction = torch.where(opaque, 0.0, clamp(halvings / most, 0, 1))
             self.depth = torch.where(hit, interval.start + fraction * interval.length, self.depth)
         self.clear = torch.where(mask, clear_after, self.clear)
 

@@ -25,6 +25,7 @@ class Levels:
         self.count_d = torch.tensor(counts, dtype=torch.float64, device=args.place_33.device)
         # (d,) nodes along a side of the root cube, and the side of a node in tree units
         self.size_d = 1 / self.count_d
+        self.finest_d = self.count_d.flip(0).to(torch.int64)  # nodes of the largest depth a side
         brick_size = args.bricks_bzyxc.shape[1] - 2 * args.border
         self.scale_d = (brick_size * self.count_d).to(real)  # (d,) voxels a tree unit
         # (d,) side of a voxel, world units
@@ -47,8 +48,7 @@ class Levels:
 
     def cells(self, finest: Tensor, depth: Tensor) -> Tensor:
         """Returns (r, 3) int64 x, y, z of the nodes at a depth (r,) that contain the finest."""
-        cells_per_node = self.count_d[len(self.count_d) - 1 - depth].to(torch.int64)
-        return finest // cells_per_node[:, None]
+        return finest // self.finest_d[depth, None]
 
     def corners(self, finest: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Returns (r, 3) float64 low and high corners of the same nodes."""
