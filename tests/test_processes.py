@@ -9,6 +9,7 @@ import pickle
 from concurrent.futures import Future
 from pathlib import Path
 
+import loaders
 import numpy as np
 import pytest
 import torch
@@ -70,43 +71,11 @@ def test_a_store_is_pickled_with_what_it_was_asked_for(tmp_path):
     assert other.time == 1 and np.array_equal(other.read_region(0, *whole), data[1][..., 1:])
 
 
-class Pictures(torch.utils.data.Dataset):
-    """Pictures of a store, whose producer is made by the worker (`inside`) or before."""
-
-    def __init__(self, path: str, inside: bool = False):
-        self.path = path
-        self.producer = None if inside else gv.StoredProducer(path)
-
-    def __len__(self) -> int:
-        return 2
-
-    def __getitem__(self, index: int) -> torch.Tensor:
-        producer = copy.deepcopy(self.producer) or gv.StoredProducer(self.path)
-        with gv.Engine(producer, **POOLS) as engine:
-            view = gv.Camera.orbit(40 * index, width=8, height=8)
-            return engine.render(view, gv.TransferFunction.preset("gray", 0, 255)).color
-
-
-def by_workers() -> dict[str, float | str]:
-    """Returns the light of the pictures, or the error, by what the workers do."""
-    results: dict[str, float | str] = {}
-    for method, where in (("fork", "inside"), ("fork", "outside"), ("spawn", "outside")):
-        loader = torch.utils.data.DataLoader(
-            Pictures(os.environ["STORE"], where == "inside"),
-            num_workers=1, timeout=300, multiprocessing_context=method,
-        )  # fmt: skip
-        try:
-            results[f"{method} {where}"] = sum(float(one.sum()) for one in loader)
-        except Exception as error:
-            results[f"{method} {where}"] = " ".join(str(error).split())[-400:]
-    return results
-
-
 @pytest.fixture(scope="module")
 def workers(store, tmp_path_factory) -> dict[str, float | str]:
-    """What `by_workers` returns in a process that has opened no store before."""
+    """What `loaders.by_workers` returns in a process that has opened no store before."""
     folder = tmp_path_factory.mktemp("workers")
-    return result(start(by_workers, folder, instructions(), STORE=str(store)))
+    return result(start(loaders.by_workers, folder, instructions(), STORE=str(store)))
 
 
 def test_an_engine_says_that_it_is_not_copied(blobs):
