@@ -144,7 +144,7 @@ def test_streamed_equals_resident(compiled, directions):
         producer = gv.VolumeProducer(volume, filtered=shader)
         with gv.Engine(producer, brick_size=4, brick_pool=size, device=device) as engine:
             for distance in (1.5, 4.0, 10.0):
-                camera = gv.Camera.orbit(width=24, height=18, distance=distance)
+                camera = gv.Camera.orbit(width=40, height=30, distance=distance)
                 actual, expected = engine.render(camera, shader), gv.render(tree, camera, resident)
                 assert actual.stats.converged and actual.alpha.max() > 0.1
                 for field in FIELDS:

@@ -175,7 +175,7 @@ def test_scouts_go_only_where_something_was_written(traced, blobs):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("producer", [gv.VolumeProducer, Late])
 def test_pools_stay_in_order_where_counts_come_at_random(blobs, monkeypatch, producer):
-    """250 frames each, from pools of a few slots; `Checked` asserts after every frame."""
+    """500 frames each, from pools of a few slots; `Checked` asserts after every frame."""
     pick = random.Random(11)
     monkeypatch.setattr(Readback, "arrived", property(lambda self: pick.random() < 0.4))
     tree = gv.N3Tree.from_volume(blobs, 4)
@@ -186,7 +186,7 @@ def test_pools_stay_in_order_where_counts_come_at_random(blobs, monkeypatch, pro
         loading = ("straight", "levels")[trial % 2]
         with Checked(producer(blobs), loading=loading, **options) as engine:
             azimuth, distance = 0.0, 1.0
-            for _ in range(62):
+            for _ in range(125):
                 azimuth += pick.gauss(0, 20)
                 distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.2))))
                 view = camera(4, azimuth=azimuth % 360 - 180, distance=distance)
