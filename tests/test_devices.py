@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import pytest
 import torch
 from helpers.packets import INSTRUCTIONS, result, start
@@ -14,9 +16,10 @@ import gvtorch as gv
 FIELDS = ("color", "alpha", "depth", "samples")
 
 
+@cache
 def traced() -> list[torch.Tensor]:
     """Returns pictures of voxels of each size, with blended levels, on the CPU."""
-    values = torch.rand(40, 40, 40, generator=torch.Generator().manual_seed(4))
+    values = torch.rand(32, 32, 32, generator=torch.Generator().manual_seed(4))
     results = []
     for dtype, factor in ((torch.uint8, 255), (torch.float16, 1), (torch.float32, 1)):
         tree = gv.N3Tree.from_volume(gv.Volume((values * factor).to(dtype)), 8)

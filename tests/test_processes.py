@@ -6,23 +6,24 @@ import copy
 import multiprocessing
 import os
 import pickle
-import subprocess
-import sys
-import textwrap
 from concurrent.futures import Future
 from pathlib import Path
 
+import loaders
 import numpy as np
 import pytest
 import torch
 from helpers import meshes
+from helpers.packets import result, start
 from helpers.pictures import GRAY, assert_same_picture
 from helpers.stores import noise
 
 import gvtorch as gv
+from gvtorch.cpp_ext import instructions
 from gvtorch.io.stores.conversion import convert
 
 VIEW = gv.Camera.orbit(width=16, height=12)
+POOLS = {"node_pool": "1 MB", "brick_pool": "4 MB"}
 
 
 @pytest.fixture(scope="module")
@@ -48,15 +49,15 @@ def test_producers_are_pickled(store, name):
     shader = gv.StoredColor("rgba") if "rgba" in producer.channels else None
     shader = shader or gv.TransferFunction.preset("gray", 0, 1)
     other = pickle.loads(pickle.dumps(producer))
-    with gv.Engine(producer) as engine:
+    with gv.Engine(producer, **POOLS) as engine:
         expected = engine.render(VIEW, shader)
         assert expected.alpha.max() > 0
         again = copy.deepcopy(other)  # before an engine has prepared it
         used = copy.deepcopy(producer)  # a copy serves no engine
-        with gv.Engine(used) as second:
+        with gv.Engine(used, **POOLS) as second:
             assert torch.equal(second.render(VIEW, shader).color, expected.color)
     for copied in (other, again, pickle.loads(pickle.dumps(used))):
-        with gv.Engine(copied) as engine:
+        with gv.Engine(copied, **POOLS) as engine:
             assert torch.equal(engine.render(VIEW, shader).color, expected.color)
 
 
@@ -70,35 +71,11 @@ def test_a_store_is_pickled_with_what_it_was_asked_for(tmp_path):
     assert other.time == 1 and np.array_equal(other.read_region(0, *whole), data[1][..., 1:])
 
 
-WORKERS = """
-    import copy, sys, torch, gvtorch as gv
-
-    class Pictures(torch.utils.data.Dataset):
-        def __init__(self, path, inside):
-            self.path = path
-            self.producer = None if inside else gv.StoredProducer(path)
-
-        def __len__(self):
-            return 3
-
-        def __getitem__(self, index):
-            producer = copy.deepcopy(self.producer) or gv.StoredProducer(self.path)
-            with gv.Engine(producer, brick_pool="1 MB", node_pool="1 MB") as engine:
-                view = gv.Camera.orbit(40 * index, width=8, height=8)
-                return engine.render(view, gv.TransferFunction.preset("gray", 0, 255)).color
-
-    if __name__ == "__main__":
-        path, method, *where = sys.argv[1:]
-        for place in where:
-            pictures = Pictures(path, place == "inside")
-            loader = torch.utils.data.DataLoader(
-                pictures, num_workers=1, timeout=100, multiprocessing_context=method
-            )
-            try:
-                print("sum", sum(float(one.sum()) for one in loader))
-            except Exception as error:
-                print("error", " ".join(str(error).split())[-400:])
-"""
+@pytest.fixture(scope="module")
+def workers(store, tmp_path_factory) -> dict[str, float | str]:
+    """What `loaders.by_workers` returns in a process that has opened no store before."""
+    folder = tmp_path_factory.mktemp("workers")
+    return result(start(loaders.by_workers, folder, instructions(), STORE=str(store)))
 
 
 def test_an_engine_says_that_it_is_not_copied(blobs):
@@ -108,22 +85,14 @@ def test_an_engine_says_that_it_is_not_copied(blobs):
                 take(engine)
 
 
-@pytest.mark.parametrize(
-    ("method", "where"), [("spawn", ["outside"]), ("fork", ["inside", "outside"])]
-)
-def test_workers_of_data_loaders(store, tmp_path, method, where):
+@pytest.mark.parametrize("method", ["spawn", "fork"])
+def test_workers_of_data_loaders(workers, method):
     """A forked worker opens its own store; using one that was opened before is a one-line error."""
-    file = tmp_path / "workers.py"
-    file.write_text(textwrap.dedent(WORKERS))
-    run = subprocess.run(
-        [sys.executable, str(file), str(store), method, *where],
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    assert run.returncode == 0, run.stderr[-2000:]
-    first, *others = run.stdout.splitlines()
-    assert first.startswith("sum ") and float(first.split()[1]) > 0, run.stdout
-    assert len(others) == (method == "fork")
-    assert all("forked after one was opened" in line for line in others), run.stdout
+    if method == "spawn":
+        assert isinstance(workers["spawn outside"], float) and workers["spawn outside"] > 0, workers
+        return
+    assert isinstance(workers["fork inside"], float) and workers["fork inside"] > 0, workers
+    assert "forked after one was opened" in str(workers["fork outside"]), workers
 
 
 @pytest.mark.filterwarnings("ignore:.*fork")
@@ -148,6 +117,6 @@ def test_a_forked_child_has_threads_of_its_own(store):
 
         process = context.Process(target=child)
         process.start()
-        assert receive.poll(100) and "forked after one was opened" in receive.recv()
+        assert receive.poll(300) and "forked after one was opened" in receive.recv()
         process.join(60)
         assert_same_picture(engine.render(VIEW, GRAY), engine.render(VIEW, GRAY))

@@ -82,7 +82,7 @@ def assert_same_trees(actual: gv.N3Tree, expected: gv.N3Tree) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(
-    extent=st.tuples(*[st.integers(1, 21)] * 3),
+    extent=st.tuples(*[st.integers(1, 15)] * 3),
     branching=st.integers(2, 3),
     brick_size=st.integers(2, 5),
     border=st.integers(0, 2),
@@ -104,9 +104,9 @@ def test_a_tree_gives_its_volume_back_and_is_in_order(
         assert equal(field, before[name]), name
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=24, deadline=None)
 @given(
-    extent=st.tuples(*[st.integers(4, 40)] * 3),
+    extent=st.tuples(*[st.integers(4, 24)] * 3),
     branching=st.integers(2, 3),
     brick_size=st.integers(2, 8),
     border=st.integers(0, 2),
