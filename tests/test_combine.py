@@ -96,16 +96,16 @@ def test_a_mask_hides_what_it_hides():
     """A plain module masked by a solid: it is averaged where the solid is, and only there."""
     network = torch.nn.Linear(3, 2)
     field = gv.mask(network, gv.Solid(gv.sdf.Sphere(0.7), colors=False))
-    producer = gv.FieldProducer(field, 64, box=BOX, threshold=0)
+    producer = gv.FieldProducer(field, 32, box=BOX, threshold=0)
     axis = torch.arange(8)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-    layout = Layout.of(producer, 8, 1, torch.device("cpu"))
+    layout = Layout.of(producer, 4, 1, torch.device("cpu"))
     nodes = gv.Nodes(torch.stack((x, y, z, torch.full_like(x, 3)), -1).flatten(0, 2), layout)
     kind, data = producer.classify(nodes).kind, producer.fill(nodes).data["value"]
-    inside = (0.5 - (nodes.positions.norm(dim=-1) - 0.7) * 32).clamp(0, 1)[..., None]
+    inside = (0.5 - (nodes.positions.norm(dim=-1) - 0.7) * 16).clamp(0, 1)[..., None]
     assert torch.allclose(data, network(nodes.positions) * inside, atol=1e-5)
     assert not data[kind == gv.Region.EMPTY].any() and (kind == gv.Region.EMPTY).sum() > 200
-    shape = gv.FieldProducer(gv.mask(network, gv.sdf.Sphere(0.7)), 64, box=BOX, threshold=0)
+    shape = gv.FieldProducer(gv.mask(network, gv.sdf.Sphere(0.7)), 32, box=BOX, threshold=0)
     assert torch.equal(shape.fill(nodes).data["value"], data), "a distance stands for its solid"
     with pytest.raises(ValueError, match="takes no field with a margin"):
         gv.mask(network, gv.Solid(gv.Mandelbulb()))

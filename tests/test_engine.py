@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import random
+from collections.abc import Callable
 from pathlib import Path
 from typing import get_type_hints
 
@@ -28,13 +30,32 @@ def working_set(picture: gv.Picture) -> int:
     return picture.stats.bricks_used
 
 
+@pytest.fixture(scope="module")
+def whole(aneurism) -> Callable[[str, gv.Camera], gv.Picture]:
+    """Draws views of the resident tree, which is made once for each device."""
+    resident = functools.cache(lambda device: gv.N3Tree.from_volume(aneurism, device=device))
+    return functools.cache(lambda device, view: gv.render(resident(device), view, VESSELS))
+
+
 def tooth() -> gv.Volume:
     return gv.read_volume(shared("volumes/tooth_103x94x161_uint8.raw.gz"))
 
 
-@pytest.mark.parametrize("loading", ["straight", "levels"])
-@pytest.mark.parametrize("producer", [gv.VolumeProducer, Late])
-@pytest.mark.parametrize("scan", ["aneurism", "stent", "tooth", "blobs"])
+@pytest.mark.parametrize(
+    ("scan", "producer", "loading"),
+    [  # each pair of values
+        *(
+            (scan, producer, loading)
+            for scan in ("aneurism", "tooth")
+            for producer, loading in ((gv.VolumeProducer, "straight"), (Late, "levels"))
+        ),
+        *(
+            (scan, producer, loading)
+            for scan in ("stent", "blobs")
+            for producer, loading in ((gv.VolumeProducer, "levels"), (Late, "straight"))
+        ),
+    ],
+)
 def test_a_small_pool_gives_the_picture_of_the_whole(request, compiled, scan, producer, loading):
     volume = tooth() if scan == "tooth" else request.getfixturevalue(scan)
     shader = AORTA if scan == "stent" else gv.TransferFunction.preset("gray", *volume.value_range)
@@ -73,36 +94,48 @@ def test_many_views_from_one_small_pool(aneurism, lod):
         assert evicted > largest, "the views must not fit together"
 
 
+VIEW, FINE = (camera(size, distance=1.2) for size in (64, 96))
+
+
+def slots_of(picture: gv.Picture, pool: str) -> tuple[int, int]:
+    """Returns how many slots of a pool a picture needs, and the size of one in bytes."""
+    if pool == "brick_pool":
+        return working_set(picture), 1000
+    return picture.stats.tiles_used, 8 * 11
+
+
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 @pytest.mark.parametrize("pool", ["brick_pool", "node_pool"])
-def test_where_pools_are_too_small_rays_take_turns(aneurism, compiled, loading, pool):
+def test_where_pools_are_too_small_rays_take_turns(aneurism, whole, compiled, loading, pool):
     """Converged pictures equal the resident tree's, though no frame can hold all their bricks."""
-    device, view = DEVICES[compiled], camera(64, distance=1.2)
-    whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
-    slots, size = (working_set(whole), 1000) if pool == "brick_pool" else (tiles(whole), 8 * 11)
-    for share in (0.3, 0.8, 1.3):
+    device = DEVICES[compiled]
+    expected = whole(device, VIEW)
+    slots, size = slots_of(expected, pool)
+    for share in (0.45, 0.8, 1.3):
         options = {pool: int(share * slots) * size, "device": device, "loading": loading}
         with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
-            picture = engine.render(view, VESSELS)
+            picture = engine.render(VIEW, VESSELS)
             engine.validate()
             assert picture.stats.converged
             assert picture.stats.capacity_exceeded == (share < 0.5) or 0.5 < share < 1
-            assert_same_picture(picture, whole)
+            assert_same_picture(picture, expected)
 
 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
 @pytest.mark.parametrize("pool", ["brick_pool", "node_pool"])
-def test_a_frame_from_too_small_pools_is_complete_and_coarser(aneurism, compiled, loading, pool):
+def test_a_frame_from_too_small_pools_is_complete_and_coarser(
+    aneurism, whole, compiled, loading, pool
+):
     """Frames are drawn until the pools no longer change: the error falls as the pool grows."""
-    device, view = DEVICES[compiled], camera(64, distance=1.2)
-    whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
-    slots, size = (working_set(whole), 1000) if pool == "brick_pool" else (tiles(whole), 8 * 11)
+    device = DEVICES[compiled]
+    expected = whole(device, VIEW)
+    slots, size = slots_of(expected, pool)
     errors = []
     for share in (0.1, 0.3, 0.6, 1.3):
         options = {pool: int(share * slots) * size, "device": device, "loading": loading}
         with gv.Engine(gv.VolumeProducer(aneurism), **options) as engine:
             for number in range(200):
-                picture, stats = engine.frame(view, VESSELS)
+                picture, stats = engine.frame(VIEW, VESSELS)
                 stats.settle()
                 if number and not any(stats.produced.values()):
                     break
@@ -110,13 +143,9 @@ def test_a_frame_from_too_small_pools_is_complete_and_coarser(aneurism, compiled
             assert not any(stats.produced.values()), "it comes to rest"
             assert stats.capacity_exceeded == (share < 1) == (not stats.converged)
             covered = (picture.alpha > 0).float().mean()
-            assert covered > 0.8 * (whole.alpha > 0).float().mean()
-            errors.append(float((picture.color - whole.color).square().mean().sqrt()))
+            assert covered > 0.8 * (expected.alpha > 0).float().mean()
+            errors.append(float((picture.color - expected.color).square().mean().sqrt()))
     assert errors == sorted(errors, reverse=True) and errors[-1] == 0 < errors[2] < errors[0]
-
-
-def tiles(picture: gv.Picture) -> int:
-    return picture.stats.tiles_used
 
 
 @pytest.mark.backend("cpp")
@@ -172,10 +201,9 @@ def test_scouts_are_few():
 
 
 @pytest.mark.parametrize("loading", ["straight", "levels"])
-def test_scouts_save_frames(aneurism, compiled, loading):
+def test_scouts_save_frames(aneurism, whole, compiled, loading):
     """The same picture from the same bricks; the requests of all rounds add up."""
-    device, view = DEVICES[compiled], camera(96, distance=1.2)
-    whole = gv.render(gv.N3Tree.from_volume(aneurism, device=device), view, VESSELS)
+    device, view = DEVICES[compiled], FINE
     frames, bricks = [], []
     for rounds in (0, 1, 3):
         options = {"scout_rounds": rounds, "loading": loading, "device": device}
@@ -187,7 +215,7 @@ def test_scouts_save_frames(aneurism, compiled, loading):
                 converged = stats.converged
                 for name, number in {**stats.requests, **stats.produced}.items():
                     total[name] += number
-            assert_same_picture(picture, whole)
+            assert_same_picture(picture, whole(device, view))
             assert total["load"] == total["bricks"] + total["constant"]
             assert total["subdivide"] <= total["tiles"], "some were made before they were asked for"
             frames.append(engine.frames)
@@ -255,7 +283,7 @@ def test_scouts_take_nothing_that_is_in_use(blobs, compiled, loading):
     assert rounds > 100 and evicted > 20
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(seed=st.integers(0, 1000), loading=st.sampled_from(["straight", "levels"]))
 @pytest.mark.backend("cpp")
 def test_twins_and_kernels_drive_the_engine_alike(blobs, seed, loading):
@@ -263,7 +291,7 @@ def test_twins_and_kernels_drive_the_engine_alike(blobs, seed, loading):
     pick = random.Random(seed)
     views = [
         camera(8, azimuth=pick.uniform(0, 360), distance=pick.choice([0.3, 1.2, 4.0]))
-        for _ in range(4)
+        for _ in range(2)
     ]
     shader = gv.TransferFunction.preset("gray", 0, 1)
     fields = []
@@ -355,27 +383,27 @@ def test_pools_are_honoured_to_the_byte():
 
 @pytest.mark.backend("cpp")
 def test_a_wandering_camera_leaves_memory_flat(blobs):
-    """After 1,000 frames nothing has piled up, and the pools are valid."""
+    """After 400 frames nothing has piled up, and the pools are valid."""
     pick = random.Random(7)
     shader = gv.TransferFunction.preset("gray", 0, 1)
     options = {"brick_size": 4, "brick_pool": 60 * 6**3 * 4, "node_pool": 40 * 8 * 20}
     azimuth, distance, live, pages, evicted = 0.0, 1.0, [], [], 0
     with gv.Engine(gv.VolumeProducer(blobs), **options) as engine:
-        for number in range(1_000):
+        for number in range(400):
             azimuth += pick.gauss(0, 12)
             distance = min(3.0, max(0.2, distance * np.exp(pick.gauss(0, 0.1))))
             view = camera(4, azimuth=azimuth % 360 - 180, distance=distance)
             _, stats = engine.frame(view, shader)
             evicted += stats.evicted["bricks"]
-            if number % 250 == 249:
+            if number % 100 == 99:
                 engine.validate()
                 gc.collect()
                 live.append(sum(isinstance(item, torch.Tensor) for item in gc.get_objects()))
                 pages.append(int(Path("/proc/self/statm").read_text().split()[1]))
         engine.validate()
         assert len(live) == 4 and max(live) - live[0] <= 8, live  # others' garbage may be freed
-        assert (pages[-1] - pages[0]) * 4096 < 20e6, "resident memory is flat"
-        assert evicted > 100 and len(engine.production.failures) == 0
+        assert (pages[-1] - pages[0]) * 4096 < 8e6, "resident memory is flat"
+        assert evicted > 40 and len(engine.production.failures) == 0
 
 
 @pytest.mark.backend("cpp")
@@ -457,7 +485,7 @@ def test_trees_must_agree_on_channels(blobs):
 def test_stages_show_in_the_profiler_and_cost_nothing_without_listeners(blobs):
     shader = gv.TransferFunction.preset("gray", 0, 1)
     with gv.Engine(gv.VolumeProducer(blobs), brick_size=4, monitor=False) as engine:
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as seen:
+        with torch.autograd.profiler.profile() as seen:  # torch.profiler's imports take seconds
             for _ in range(2):
                 engine.frame(camera(8), shader)
         names = {event.key for event in seen.key_averages()}
@@ -466,8 +494,13 @@ def test_stages_show_in_the_profiler_and_cost_nothing_without_listeners(blobs):
 
 
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("branching", [2, 3, 4])
-@pytest.mark.parametrize("dtype", ["uint16", "int8", "int16", "float16", "bfloat16"])
+@pytest.mark.parametrize(
+    ("dtype", "branching"),  # each size of a number and each branching
+    [
+        *(("uint16", 2), ("int16", 3), ("float16", 4), ("bfloat16", 3)),
+        *(("int8", 2), ("int8", 3), ("int8", 4)),
+    ],
+)
 def test_every_dtype_and_branching_streams_the_same_bits(dtype, branching):
     """The second component of a second channel, through pools that must evict bricks."""
     z, y, x = np.mgrid[-1:1:40j, -1:1:30j, -1:1:50j]

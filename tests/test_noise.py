@@ -51,7 +51,7 @@ def random_points(count: int, n: int, dtype=torch.float64, size: float = 40.0) -
 @named
 @both
 def test_noise_is_that_of_plain_numpy(name, n):
-    points = random_points(300, n)
+    points = random_points(120, n)
     points[:20] = points[:20].round()  # the lattice itself
     expected = [PLAIN[name](point, seed=5) for point in points.tolist()]
     actual = ALL[name](points, seed=5)
@@ -113,8 +113,8 @@ def test_sums_repeat_with_the_period_of_their_first_octave(n):
     ],
 )
 def test_fractal_sums_are_those_of_plain_numpy(name, changes):
-    """At 10^3 points; one sharpness clamps the weights of ridges to 1, the other hardly does."""
-    points = random_points(1000, 3)
+    """One sharpness clamps the weights of ridges to 1, the other hardly does."""
+    points = random_points(400, 3)
     options = {"octaves": 3, "lacunarity": 1.9, "gain": 0.6, "seed": 3, **changes}
     expected = [getattr(numpy_noise, name)(point, **options) for point in points.tolist()]
     actual = getattr(noise, name)(points, **options)
@@ -136,11 +136,11 @@ def test_bounds_hold_at_a_million_points(name, n):
 
 @named
 @both
-def test_slopes_hold_at_400_000_points(name, n):
+def test_slopes_hold_at_150_000_points(name, n):
     slope, random = noise.bounds(ALL[name], n).slope, torch.Generator().manual_seed(3)
     steepest = 0.0
     for seed in range(10):
-        points = random_points(40_000, n)
+        points = random_points(15_000, n)
         step = torch.randn(points.shape, generator=random, dtype=torch.float64)
         step *= 1e-5 / step.norm(dim=1, keepdim=True)
         ends = (ALL[name](p, seed=seed) for p in (points - step, points + step))
@@ -236,7 +236,7 @@ def test_hashes_of_neighbours_share_nothing():
 
 
 def test_gradient_noise_has_the_gradients_of_autograd():
-    points = random_points(20, 3).requires_grad_()
+    points = random_points(8, 3).requires_grad_()
     for function in (noise.perlin, noise.simplex, noise.value, noise.fbm):
         assert torch.autograd.gradcheck(function, points)
 
@@ -245,6 +245,7 @@ def test_gradient_noise_has_the_gradients_of_autograd():
 def test_noise_compiles_to_one_graph(name):
     """Without graph breaks for values read on the host, and with the same bits on the CPU."""
     points, plain = random_points(3000, 3, torch.float32), getattr(noise, name)
+    plain = partial(plain, octaves=2) if name in ("fbm", "warp") else plain
     compiled = torch.compile(plain, fullgraph=True, backend="aot_eager")
     assert torch.equal(compiled(points, seed=3), plain(points, seed=3))
 

@@ -8,7 +8,6 @@ import torch
 from helpers.shapes import (
     ALL,
     BLUE,
-    BOXES,
     FRACTALS,
     RED,
     SHAPES,
@@ -27,6 +26,7 @@ from gvtorch.fields.field import box_distance
 from gvtorch.fields.fractals import Power
 
 sdf = gv.sdf
+BOXES = 20_000  # in which each shape's bounds are tested
 
 
 @pytest.fixture(params=SHAPES, name="named")
@@ -110,7 +110,7 @@ def test_values_are_those_of_numpy(named):
 def test_intervals_of_repeated_shapes_hold_where_cells_change(make, by):
     """A value that is no distance may be less at the next but one copy, and jumps there."""
     shape = sdf.Offset(make(), by)
-    center, half = random_boxes(BOXES // 10)
+    center, half = random_boxes(5000)
     low, high = shape.bounds(center, half)
     value = shape(points_inside(center, half, 27))
     assert (value >= low[:, None] - 1e-12).all() and (value <= high[:, None] + 1e-12).all()
@@ -315,7 +315,7 @@ def test_boxes_hold_what_grows_from_stretched_shapes(make):
     """Where space is stretched, beyond a corner of an intersection, and around a fractal, an offset
     reaches farther in the world than in the value.
     """
-    shape, points = make(), random_points(100_000, 14.0)
+    shape, points = make(), random_points(40_000, 14.0)
     low, high = shape.box()
     inside = points[shape(points) < 0]
     assert len(inside) > 20 and ((inside >= low) & (inside <= high)).all()

@@ -49,6 +49,17 @@ def tracing(
 
 
 LISTED = ("ray_index", "node", "brick", "depth", "interval", "distance")
+NEAR_AND_FAR = (0.2, 1.3, 6.0)
+
+
+def rays_from(tree, size=24) -> gv.Rays:
+    """Returns rays of cameras at `NEAR_AND_FAR`, one after another: the twin takes as many steps
+    for all of them as for the longest.
+    """
+    parts = [camera_rays(tree, size, distance=distance) for distance in NEAR_AND_FAR]
+    names = ("origin", "direction", "cone", "range")
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return gv.Rays(**columns, width=size)
 
 
 def tensors(segments) -> dict[str, torch.Tensor]:
@@ -81,12 +92,13 @@ def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False
 )
 def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod, hides):
     tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
-    for distance in (0.2, 1.3, 6.0):
-        rays = camera_rays(tree, 24 if distance > 2 else 14, distance=distance)
-        for limit in (0, 5) if distance == 1.3 else (0,):
-            result = assert_same_walk(tree, compiled, rays, lod=lod, hides=hides, limit=limit)
-            if distance > 1 and not limit:
-                assert len(result["values"]) > 100 and result["values"].max() > 0.5
+    rays = rays_from(tree)
+    for limit in (5, 0):
+        result = assert_same_walk(tree, compiled, rays, lod=lod, hides=hides, limit=limit)
+    samples = result["counts"][:, 1].view(3, -1).sum(1)
+    assert samples[1:].min() > 100, "from afar as well"
+    begin = len(result["values"]) - int(samples[2])
+    assert min(values.max() for values in result["values"].split([begin, int(samples[2])])) > 0.5
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -95,7 +107,7 @@ def test_compiled_equals_reference_for_dtypes(blobs, compiled, voxel, dtype):
     data = (blobs.data * 100).to(getattr(torch, voxel))
     tree = gv.N3Tree.from_volume(gv.Volume(data), 4, 2)
     rays = camera_rays(tree, distance=1.3)
-    result = assert_same_walk(tree, compiled, rays, dtype=dtype, by_node=True)
+    result = assert_same_walk(tree, compiled, rays, dtype=dtype, by_node=True, step=2.5)
     assert result["values"].dtype == dtype and result["values"].max() > 50
 
 
@@ -119,11 +131,10 @@ def test_missing_nodes_give_equal_segments_and_requests(
 
 
 @pytest.mark.parametrize("lod", ["finest", "auto"])
-@pytest.mark.parametrize("distance", [0.2, 1.3, 6.0])
-def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
+def test_segments_are_what_trace_rays_samples(blobs, backend, lod):
     """Same number of samples, same marks, same requests, in a tree with missing parts."""
     tree = with_holes(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
-    rays = camera_rays(tree, distance=distance)
+    rays = rays_from(tree)
     ray_args, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
     haze = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.1)])  # nothing is opaque
     sampling = Sampling(
@@ -137,8 +148,9 @@ def test_segments_are_what_trace_rays_samples(blobs, backend, lod, distance):
     walked = drawn._replace(**{name: getattr(drawn, name).clone() for name in MARKS})
     *_, samples, missed = trace_rays(ray_args, drawn, backend=backend)
     segments = trace_segments(ray_args, walked, backend=backend)
-    assert torch.equal(segments.counts[:, 1], samples) and samples.max() > 10
-    assert torch.equal(segments.missed, missed) and missed.any()
+    assert torch.equal(segments.counts[:, 1], samples)
+    assert samples.view(3, -1).amax(1).min() > 10, "from each distance"
+    assert torch.equal(segments.missed, missed) and missed.view(3, -1).any(1).all()
     for name in MARKS:
         assert torch.equal(getattr(walked, name), getattr(drawn, name)), name
 
@@ -156,13 +168,18 @@ def table_colors(values_k, level_k, table) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("lod", ["finest", "auto"])
-@pytest.mark.parametrize("limit", [0, 16])
-def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod, limit):
+def test_sampled_and_composited_segments_are_the_picture(blobs, backend, lod):
     """The pipeline of separate ops against the fused one, at once and in parts."""
     tree = gv.N3Tree.from_volume(blobs, 8)
     rays = camera_rays(tree, distance=1.3)
-    ray_args, traced = tracing(tree, backend, rays, lod=lod)
-    color, alpha, _, samples, _ = trace_rays(ray_args, traced, backend=backend)
+    ray_args, traced = tracing(tree, backend, rays, lod=lod, step=1.5)
+    drawn = trace_rays(ray_args, traced, backend=backend)
+    for limit in (0, 10):
+        assert_segments_are_the_picture(ray_args, traced, drawn, limit, backend)
+
+
+def assert_segments_are_the_picture(ray_args, traced, drawn, limit: int, backend: str) -> None:
+    color, alpha, _, samples, _ = drawn
     count = len(samples)
     total, clear = torch.zeros_like(color), torch.ones_like(alpha[:, 0])
     taken, state, rounds = torch.zeros_like(samples), None, 0
@@ -243,7 +260,8 @@ def test_gradient_by_bricks_and_constants(blobs, compiled):
     rays = camera_rays(tree, 16, distance=1.5)
     grads = []
     for backend in ("reference", compiled):
-        ray_args, traced = tracing(tree, backend, rays, dtype=torch.float64, hides=False)
+        options = {"dtype": torch.float64, "hides": False, "step": 2.5}
+        ray_args, traced = tracing(tree, backend, rays, **options)
         segments = trace_segments(ray_args, traced, backend=backend)
         pool = (traced.bricks_bzyxc, traced.constant_tnc)
         leaves = [tensor.clone().requires_grad_() for tensor in pool]

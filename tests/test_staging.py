@@ -160,17 +160,15 @@ def test_bad_tables_are_named():
     assert torch.equal(some[torch.tensor([0, 2])].gather(), table.bricks[[4, 1]])
 
 
-SIDE = 50  # bricks along a side: 125,000
-
-
 class Numbered(gv.Producer):
     """Bricks in which every voxel identifies its node, in two channels."""
 
     where, patience = "host", 0.5
 
-    def __init__(self):
+    def __init__(self, side: int = 50):
+        self.bricks = side**3
         channels = {"value": gv.Channel(torch.uint8), "wide": gv.Channel(torch.uint16, 2)}
-        super().__init__(8 * SIDE, channels=channels)
+        super().__init__(8 * side, channels=channels)
 
     def make(self, loc):
         row = (loc * torch.tensor([1, 101, 10007, 31], device=loc.device)).sum(1)
@@ -199,7 +197,7 @@ THREAD = ThreadPoolExecutor(1)
 
 def grown(producer, device, **options) -> gv.Engine:
     """Returns an engine whose tree has all tiles and no brick except the root's."""
-    pools = {"node_pool": "40 MB", "brick_pool": f"{(SIDE**3 + 100) * 5} kB"}
+    pools = {"node_pool": "40 MB", "brick_pool": f"{(producer.bricks + 100) * 5} kB"}
     engine = gv.Engine(producer, device=device, **{**pools, **options})
     nodes = engine.cache.nodes
     for depth in range(producer.layout.depth):
@@ -208,6 +206,11 @@ def grown(producer, device, **options) -> gv.Engine:
         lacks &= linked(engine)
         serve(engine, lacks.nonzero()[:, 0], config.REQUEST_SUBDIVIDE)
     return engine
+
+
+def side_on(device) -> int:
+    """Returns bricks along a side, 125,000 in all on a GPU, else fewer."""
+    return 50 if device.type == "cuda" else 24
 
 
 def linked(engine) -> torch.Tensor:
@@ -258,13 +261,13 @@ def assert_slots_hold_what_the_producer_made(engine, nodes) -> None:
 @pytest.mark.parametrize("where", ["host", "device", "later", "mixed"])
 def test_slots_hold_what_the_producer_made(device, where):
     """Bricks in random order, answered on the host and on the device, now and later."""
-    producer = Numbered()
+    producer = Numbered(side_on(device))
     producer.where = where
     with grown(producer, device) as engine:
         nodes = finest(engine)
-        assert len(nodes) == SIDE**3
+        assert len(nodes) == producer.bricks
         mixed = torch.randperm(len(nodes), generator=torch.Generator().manual_seed(2))
-        nodes = nodes[mixed.to(device)][: 100_000 if device.type == "cuda" else 20_000]
+        nodes = nodes[mixed.to(device)][: 100_000 if device.type == "cuda" else 10_000]
         todo, moved = batches(nodes), 0
         for _ in range(2000):
             batch = todo.pop() if todo else nodes[:0]
@@ -309,10 +312,10 @@ def batches(nodes) -> list[torch.Tensor]:
 @pytest.mark.parametrize("where", ["host", "later"])
 def test_what_finds_no_room_is_held_until_a_later_frame(device, where):
     """A payload many times larger than the ring, in one frame: the ring takes what fits."""
-    with grown(Numbered(), device, load_budget=1000) as engine:
+    with grown(Numbered(side_on(device)), device, load_budget=1000) as engine:
         if device.type == "cpu":
             engine.production.staging = Staging(5_000_000, 5000, device)
-        producer, nodes = engine.trees["scene"].producer, finest(engine)[:20_000]
+        producer, nodes = engine.trees["scene"].producer, finest(engine)[:10_000]
         producer.where = where
         serve(engine, nodes[:1], config.REQUEST_LOAD)
         serve(engine, nodes[1:], config.REQUEST_LOAD)
@@ -339,10 +342,21 @@ def test_a_producer_that_never_answers_stalls_no_frame(device):
         engine.validate()
 
 
+SMALL, WIDE = {"brick_size": 4}, {"brick_size": 6, "border": 2}
+
+
 @pytest.mark.parametrize("backend", ["cpp", "cuda"])
-@pytest.mark.parametrize("hold", ["voxels", "bricks", "mapped"])
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
-def test_bricks_cut_ahead_give_the_picture_of_the_volume(blobs, backend, hold, dtype):
+@pytest.mark.parametrize(
+    ("hold", "dtype", "sizes"),  # each pair of values
+    [
+        *(("voxels", torch.uint8, SMALL), ("bricks", torch.uint8, WIDE)),
+        *(("mapped", torch.uint8, SMALL), ("voxels", torch.uint16, WIDE)),
+        *(("bricks", torch.uint16, SMALL), ("mapped", torch.uint16, WIDE)),
+        *(("voxels", torch.float32, SMALL), ("bricks", torch.float32, WIDE)),
+        ("mapped", torch.float32, SMALL),
+    ],
+)
+def test_bricks_cut_ahead_give_the_picture_of_the_volume(blobs, backend, hold, dtype, sizes):
     if unavailable()[backend]:
         pytest.skip(f"backend {backend}: {unavailable()[backend]}")
     values = blobs.data * (1 if dtype == torch.float32 else 250)
@@ -352,12 +366,11 @@ def test_bricks_cut_ahead_give_the_picture_of_the_volume(blobs, backend, hold, d
         blobs.origin,
     )
     shader = gv.TransferFunction.preset("gray", *volume.value_range)
-    for sizes in ({"brick_size": 4}, {"brick_size": 6, "border": 2}):
-        tree = gv.N3Tree.from_volume(volume, *sizes.values(), device=DEVICES[backend])
-        view = camera(24, distance=1.3)
-        expected = gv.render(tree, view, shader)
-        producer = gv.VolumeProducer(volume, hold=hold)
-        with gv.Engine(producer, device=DEVICES[backend], **sizes) as engine:
-            picture = engine.render(view, shader)
-            engine.validate()
-        assert torch.equal(picture.color, expected.color) and expected.alpha.max() > 0.3
+    tree = gv.N3Tree.from_volume(volume, *sizes.values(), device=DEVICES[backend])
+    view = camera(24, distance=1.3)
+    expected = gv.render(tree, view, shader)
+    producer = gv.VolumeProducer(volume, hold=hold)
+    with gv.Engine(producer, device=DEVICES[backend], **sizes) as engine:
+        picture = engine.render(view, shader)
+        engine.validate()
+    assert torch.equal(picture.color, expected.color) and expected.alpha.max() > 0.3

@@ -79,34 +79,40 @@ def test_second_channel_and_second_component(blobs, compiled):
     assert torch.equal(result["alpha"], single["alpha"])
 
 
-@settings(max_examples=25, deadline=None)
+@pytest.fixture(scope="module")
+def tree(blobs) -> gv.N3Tree:
+    """Each trace is of a copy."""
+    return gv.N3Tree.from_volume(blobs, 4)
+
+
+@settings(max_examples=15, deadline=None)
 @given(
     share=st.floats(0, 1),
     seed=st.integers(0, 2**31),
     lod=st.sampled_from(["auto", "finest"]),
+    step=st.sampled_from([1.0, 2.5]),
     distance=st.floats(0.1, 8),
     azimuth=st.floats(-180, 180),
     elevation=st.floats(-90, 90),
 )
 @pytest.mark.backend("cpp")
 def test_missing_nodes_give_equal_pictures_and_requests(
-    blobs, share, seed, lod, distance, azimuth, elevation
+    tree, share, seed, lod, step, distance, azimuth, elevation
 ):
-    tree = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
     rays = camera_rays(tree, 12, distance=distance, azimuth=azimuth, elevation=elevation)
-    assert_equal(tree, "cpp", rays, lod=lod)
+    assert_equal(with_holes(tree, share, seed), "cpp", rays, lod=lod, step=step)
 
 
-def test_requests_name_what_is_missing(blobs, backend):
-    tree = gv.N3Tree.from_volume(blobs, 4)
+def test_requests_name_what_is_missing(tree, backend):
     rays = camera_rays(tree, distance=1.2)
-    _, full = trace(tree, backend, rays, lod="finest")
+    options = {"lod": "finest", "step": 2.5}
+    _, full = trace(tree, backend, rays, **options)
     seen = (full["brick"] == 1).nonzero()[:, 0]
     gone = copy_to(tree, "cpu")
     slot = int(seen[-1])  # finest bricks come last
     node = int(tree.bricks.owner_b[slot])
     gone.nodes.brick_tn.view(-1)[node] = config.ABSENT
-    _, marks = trace(gone, backend, rays, lod="finest")
+    _, marks = trace(gone, backend, rays, **options)
     word = int(marks["request"].view(-1)[node])
     assert word & config.REQUEST_LOAD and not word & config.REQUEST_SUBDIVIDE
     assert word & config.REQUEST_PRIORITY == config.REQUEST_PRIORITY, (
@@ -117,7 +123,7 @@ def test_requests_name_what_is_missing(blobs, backend):
 
     gone = copy_to(tree, "cpu")
     gone.nodes.child_tn.view(-1)[tree.root] = config.ABSENT
-    _, marks = trace(gone, backend, rays, lod="finest")
+    _, marks = trace(gone, backend, rays, **options)
     assert int(marks["request"].view(-1)[tree.root]) & config.REQUEST_SUBDIVIDE
     assert (marks["request"] != 0).sum() == 1
 
@@ -184,8 +190,8 @@ def test_skipping_does_not_move_samples(blobs, backend):
     low, high = gv.Channel(torch.float32).limits
     full.nodes.ranges["value"][:, :, 0], full.nodes.ranges["value"][:, :, 1] = low, high
     rays = camera_rays(sparse, distance=1.3)
-    a, _ = trace(sparse, backend, rays, lod="finest")
-    b, _ = trace(full, backend, rays, lod="finest")
+    a, _ = trace(sparse, backend, rays, lod="finest", step=2.5)
+    b, _ = trace(full, backend, rays, lod="finest", step=2.5)
     assert (a["samples"] < b["samples"]).any()
     assert torch.equal(a["alpha"], b["alpha"]) and torch.equal(a["color"], b["color"])
 
@@ -337,7 +343,7 @@ def test_trace_checks_what_it_is_given(blobs):
             call()
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     share=st.floats(0, 1),
     seed=st.integers(0, 2**31),
@@ -347,12 +353,12 @@ def test_trace_checks_what_it_is_given(blobs):
 )
 @pytest.mark.backend("cpp")
 def test_transparent_ranges_ask_for_nothing_and_change_no_bit(
-    blobs, share, seed, low, lod, by_level
+    tree, share, seed, low, lod, by_level
 ):
     """Nodes whose range is transparent are not requested; a tree with unknown ranges gives the same
     picture in every bit, and requests more."""
     shader = gv.TransferFunction.from_points([(low, 0), (low + 0.1, 0.3)], [(0, 1, 0, 0)])
-    ranged = with_holes(gv.N3Tree.from_volume(blobs, 4), share, seed)
+    ranged = with_holes(tree, share, seed)
     unknown = copy_to(ranged, "cpu")
     limits = gv.Channel(torch.float32).limits
     unknown.nodes.ranges["value"][:, :, 0], unknown.nodes.ranges["value"][:, :, 1] = limits
@@ -371,7 +377,7 @@ def run_by_level(tree, rays, shader, lod, by_level):
     runs = []
     for backend in ("reference", "cpp"):
         copy = copy_to(tree, "cpu")
-        options = gv.RenderOptions(backend=backend, lod=lod)
+        options = gv.RenderOptions(backend=backend, lod=lod, step=2.0)
         runs.append((vars(Tracer(copy, shader, options, by_level=by_level)(rays)), copy))
     (expected, twin), (actual, kernel) = runs
     for name in ("color", "alpha", "depth", "samples", "missed"):

@@ -239,13 +239,13 @@ def assert_message_or_line(text: str | bytes) -> None:
     assert type(message) in MESSAGES.values()
 
 
-@settings(max_examples=1500, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=700, deadline=None, suppress_health_check=list(HealthCheck))
 @given(NEAR.map(json.dumps) | st.text() | st.binary())
 def test_whatever_comes_is_a_message_or_a_line(text):
     assert_message_or_line(text)
 
 
-@settings(max_examples=1000, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=450, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.data())
 def test_a_state_with_one_wrong_place_is_refused_or_another_state(data):
     """One number, name or object of a valid state is replaced by anything."""
