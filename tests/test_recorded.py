@@ -232,7 +232,7 @@ def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
 def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
     """If rays need it: views from afar do not, nor is there more below the last level."""
     device = DEVICES[backend]
-    size, batch = (32, 1024) if loading == "levels" else (64, 4096)
+    size, batch = (32, 1024) if loading == "levels" else (64, 2048)
     options = {"brick_pool": "64 MB", "loading": loading, "device": device}
     with gv.Engine(Ball(1024, branching), **options) as engine:
         frames, depth = Frames(engine, view(size), TRANSFER, batch), []
