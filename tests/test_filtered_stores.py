@@ -4,6 +4,7 @@ or damaged parts are reported.
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 
@@ -20,6 +21,7 @@ MISTY = gv.TransferFunction([(30, 0), (250, 0.08)], [(30, 1, 0.3, 0.1), (250, 1,
 OPAQUE = gv.TransferFunction([(100, 0), (120, 0.9)], [(100, 1, 0.3, 0.1), (250, 1, 1, 1)])
 
 
+@functools.cache
 def matter(dtype: torch.dtype = torch.uint8, width: int = 1) -> gv.Volume:
     """Returns rough matter and a region of zeros, more than one block wide, of odd extent."""
     generator = torch.Generator().manual_seed(2)
@@ -33,22 +35,64 @@ def matter(dtype: torch.dtype = torch.uint8, width: int = 1) -> gv.Volume:
     return gv.Volume(data.to(torch.int32).to(dtype) if dtype == torch.uint16 else data.to(dtype))
 
 
+@functools.cache
+def part(dtype: torch.dtype = torch.uint8, width: int = 1) -> gv.Volume:
+    """Returns 24^3 voxels of it, for what does not depend on the number of blocks."""
+    return gv.Volume(matter(dtype, width).data[:24, 15:39, :24].contiguous())
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    """Stores of the matter, and of a part without colours and with misty ones; tests change copies
+    of them.
+    """
+    folder = tmp_path_factory.mktemp("stores")
+    gv.convert(matter(), folder / "plain.zarr")
+    gv.convert(part(), folder / "part.zarr")
+    shutil.copytree(folder / "part.zarr", folder / "misty.zarr")
+    gv.Filtered.add_to(folder / "misty.zarr", MISTY)
+    return folder
+
+
 @pytest.fixture
-def store(tmp_path):
-    gv.convert(matter(), tmp_path / "a.zarr")
-    return tmp_path / "a.zarr"
+def store(stores, tmp_path):
+    return shutil.copytree(stores / "plain.zarr", tmp_path / "a.zarr")
+
+
+@pytest.fixture
+def part_store(stores, tmp_path):
+    return shutil.copytree(stores / "part.zarr", tmp_path / "a.zarr")
+
+
+@pytest.fixture
+def misty_store(stores, tmp_path):
+    return shutil.copytree(stores / "misty.zarr", tmp_path / "a.zarr")
+
+
+CAMERAS = [gv.Camera.orbit(width=32, height=24, distance=distance) for distance in (1.0, 4.0, 12.0)]
+_resident = {}
+
+
+def resident_pictures(volume, shader, size: int, device: str) -> list[gv.Picture]:
+    """Returns a resident tree's pictures, made once for each volume, function, size and device."""
+    component = shader.component or 0
+    key = (id(volume), str(shader.made_of), component, size, device)
+    if key not in _resident:
+        tree = gv.N3Tree.from_volume(volume, size, device=device)
+        resident = gv.Filtered.of(
+            tree, volume, shader.transfer, component=component, directions=None
+        )
+        # Holds the volume, so that no other one gets its number.
+        _resident[key] = [gv.render(tree, camera, resident) for camera in CAMERAS], volume
+    return _resident[key][0]
 
 
 def check_streamed(path, volume, shader, size=8, device="cpu", **pools) -> None:
-    tree = gv.N3Tree.from_volume(volume, size, device=device)
-    resident = gv.Filtered.of(
-        *(tree, volume, shader.transfer), component=shader.component or 0, directions=None
-    )
+    pictures = resident_pictures(volume, shader, size, device)
     stored, pools = gv.Filtered.stored(path), {"brick_size": size, "device": device, **pools}
     with gv.Engine(gv.StoredProducer(path, filtered=stored), **pools) as engine:
-        for distance in (1.0, 4.0, 12.0):
-            camera = gv.Camera.orbit(width=32, height=24, distance=distance)
-            actual, expected = engine.render(camera, stored), gv.render(tree, camera, resident)
+        for camera, expected in zip(CAMERAS, pictures, strict=True):
+            actual = engine.render(camera, stored)
             assert actual.stats.converged and not engine.failures
             for field in ("color", "alpha", "depth"):
                 assert torch.equal(getattr(actual, field), getattr(expected, field)), field
@@ -74,7 +118,7 @@ def test_streamed_from_disk_equals_resident(compiled, store, transfer, size):
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("dtype", [torch.uint16, torch.float16, torch.float32])
 def test_dtypes_and_components(tmp_path, dtype):
-    volume = matter(dtype, width=2)
+    volume = part(dtype, width=2)
     gv.convert(volume, tmp_path / "a.zarr")
     shader = gv.Filtered.add_to(tmp_path / "a.zarr", MISTY, component=1)
     check_streamed(tmp_path / "a.zarr", volume, shader)
@@ -104,8 +148,8 @@ def test_a_store_of_one_brick(tmp_path):
     check_streamed(tmp_path / "a.zarr", volume, shader)
 
 
-def test_broken_off_work_leaves_the_store_as_it_was(store):
-    gv.Filtered.add_to(store, MISTY)
+def test_broken_off_work_leaves_the_store_as_it_was(misty_store):
+    store = misty_store
     kept = gv.Filtered.stored(store).made_of
 
     def stop(stage: str):
@@ -119,19 +163,20 @@ def test_broken_off_work_leaves_the_store_as_it_was(store):
         with pytest.raises(KeyboardInterrupt):
             gv.Filtered.add_to(store, OPAQUE, progress=stop(step))
         assert not (store / WORK).exists() and gv.Filtered.stored(store).made_of == kept
-        check_streamed(store, matter(), gv.Filtered(MISTY))
+        check_streamed(store, part(), gv.Filtered(MISTY))
     bad = gv.TransferFunction([(30, 0), (250, 0.08)])
     bad.opacity[1, 1] = float("nan")
     with pytest.raises(ValueError, match="opacity must be finite"):
         gv.Filtered.add_to(store, bad)
     shader = gv.Filtered.add_to(store, OPAQUE)
-    check_streamed(store, matter(), shader)
+    check_streamed(store, part(), shader)
     folders = {file.name for file in (store / "gvtorch" / "coarse").iterdir()}
     assert folders == {"filtered.1", "zarr.json", ".lock"}
 
 
-def test_one_at_a_time_and_nothing_is_forgotten(store):
+def test_one_at_a_time_and_nothing_is_forgotten(part_store):
     """Channels are added through one open store, by two writers at once, and during reading."""
+    store = part_store
     opened, old = gv.Store.open(store), gv.Store.open(store)
     gv.Filtered.add_to(opened, MISTY, channel="mist")
     shader = gv.Filtered.add_to(opened, OPAQUE)
@@ -234,8 +279,8 @@ def test_what_is_missing_or_damaged_is_told(store):
         None,
     ],
 )
-def test_damaged_metadata_is_told(store, attributes):
-    gv.Filtered.add_to(store, MISTY)
+def test_damaged_metadata_is_told(misty_store, attributes):
+    store = misty_store
     file = store / "gvtorch" / "coarse" / "zarr.json"
     content = json.loads(file.read_text())
     content["attributes"] = attributes
@@ -244,8 +289,8 @@ def test_damaged_metadata_is_told(store, attributes):
         gv.Filtered.stored(store)
 
 
-def test_metadata_that_is_not_json_is_named(store):
-    gv.Filtered.add_to(store, MISTY)
+def test_metadata_that_is_not_json_is_named(misty_store):
+    store = misty_store
     (store / "gvtorch" / "coarse" / "zarr.json").write_text("[")
     with pytest.raises(ValueError, match=r"a\.zarr/gvtorch/coarse/zarr\.json: damaged JSON"):
         gv.Filtered.stored(store)
@@ -277,20 +322,20 @@ def test_mistakes_are_told(store, tmp_path):
 
 
 @pytest.mark.backend("cpp")
-def test_the_command_line(store, tmp_path):
+def test_the_command_line(part_store, tmp_path):
+    store, volume = part_store, part()
     far = ("--size", "24x16", "--camera", "orbit:20,10,9", "-o", tmp_path / "a.npy")
     done = gvtorch("render", store, "--shader", "filtered", *far)
     assert done.returncode == 2 and "gvtorch filter" in done.stderr
     done = gvtorch("filter", store, "--tf", "hot", "--directions", "six")
     assert done.returncode == 0 and "of colours in" in done.stdout, done.stderr
+    tree = gv.N3Tree.from_volume(volume)
+    hot = gv.TransferFunction.preset("hot", *gv.window(volume))
+    shader = gv.Filtered.of(tree, volume, hot, directions=True)
+    expected = gv.render(tree, gv.Camera.orbit(20, 10, 9, None, 24, 16), shader)
     for options in ((), ("--tf", "hot")):  # the function that the store records
         done = gvtorch("render", store, "--shader", "filtered", *far, *options)
         assert done.returncode == 0, done.stderr
-        volume = matter()
-        tree = gv.N3Tree.from_volume(volume)
-        hot = gv.TransferFunction.preset("hot", *gv.window(volume))
-        shader = gv.Filtered.of(tree, volume, hot, directions=True)
-        expected = gv.render(tree, gv.Camera.orbit(20, 10, 9, None, 24, 16), shader)
         np.testing.assert_allclose(np.load(tmp_path / "a.npy")[..., :3], expected.color, atol=1e-6)
     for options in (("--tf", "bone"), ("--window", "3,5")):
         done = gvtorch("render", store, "--shader", "filtered", *far, *options)

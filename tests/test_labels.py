@@ -103,10 +103,10 @@ def test_a_picture_is_that_of_a_dense_nearest_marcher(backend, name, dtype):
     assert len(volume.label_values) == len(np.unique(data))
     tree = gv.N3Tree.from_volume(volume, 4, device=DEVICES[backend])
     camera = gv.Camera.orbit(40, 25, 1.5, 30, 32, 24)
-    options = {"lod": "finest", "dtype": dtype, "stop_alpha": 1.0, "step": 0.37, "backend": backend}
+    options = {"lod": "finest", "dtype": dtype, "stop_alpha": 1.0, "step": 0.87, "backend": backend}
     picture = gv.render(tree, camera, shader, **options)
     rays = orbit_rays(box_of(data.shape, SPACING, ORIGIN), 40, 25, 1.5, 30, 32, 24)
-    step = 0.37 * min(SPACING)
+    step = 0.87 * min(SPACING)
     color, alpha, label, depth, edge_distance = dense(data, rays, colors, alphas, 0.9, step)
     sure = edge_distance > (1e-10 if dtype == torch.float64 else 1e-4)
     assert sure.mean() > (0.99 if dtype == torch.float64 else 0.9) and (label >= 0).mean() > 0.2
@@ -143,7 +143,7 @@ def test_no_pixel_shows_a_label_that_is_not_there(backend, brick, distance):
     camera = gv.Camera.orbit(30, 20, distance, width=20, height=16)
     for opacity in (1.0, 0.3):
         shader = gv.Labels(colors, opacity, lit=False)
-        picture = gv.render(tree, camera, shader, backend=backend)
+        picture = gv.render(tree, camera, shader, backend=backend, step=1.3)
         assert float(picture.color[..., 1].max()) == 0 and float(picture.color[..., 0].max()) > 0.2
         total = picture.color.sum(-1, keepdim=True)
         torch.testing.assert_close(total, picture.alpha, rtol=1e-4, atol=1e-5)

@@ -102,6 +102,8 @@ def test_a_tree_that_is_turned_is_seen_by_a_camera_that_is_turned(tree_of_channe
     tree = copy_to(tree_of_channels, DEVICES[backend])
     rays, shader = camera(tree, 8 if backend == "reference" else 20), SHADERS[name]
     options = {"dtype": torch.float64, "backend": backend}
+    if backend == "reference":
+        options["step"] = 2.6
     expected = gv.trace(tree, rays.to(tree.device), shader, **options)
     assert (expected.alpha > 0.1).any()
     for matrix in POSES.values() if backend != "reference" else [POSES["a mirror"]]:

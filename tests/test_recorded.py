@@ -4,6 +4,7 @@ step, and on CUDA as one graph, for which the host never waits.
 
 from __future__ import annotations
 
+import functools
 import gc
 import math
 import time
@@ -36,10 +37,10 @@ def test_they_come_to_the_picture_that_the_host_comes_to(backend, branching, kin
         return gv.Engine(producer, brick_pool="16 MB", device=DEVICES[backend])
 
     with engine() as served:
-        expected = served.render(view(), TRANSFER)
+        expected = served.render(view(32), TRANSFER)
         assert expected.stats.converged and (expected.alpha > 0.5).any()
     with engine() as recorder:
-        frames = Frames(recorder, view(), TRANSFER, batch)
+        frames = Frames(recorder, view(32), TRANSFER, batch)
         recorder.trees["scene"].producer.batch_sizes.clear()
         produced = {"tiles": 0, "bricks": 0, "constant": 0}
         for _ in range(400):
@@ -173,14 +174,15 @@ def test_what_the_host_would_have_to_see_to_is_refused():
             frames.frame()
 
 
+@functools.cache
 def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, gv.FrameStats]:
     """Returns the number of nodes that a turning camera missed, and its final view."""
     missed, looked_ahead = 0, 0
     with gv.Engine(Ball(1024), brick_pool="64 MB", device=DEVICES[backend]) as engine:
-        engine.render(view(64, 0), TRANSFER)
-        frames = Frames(engine, view(64, 0), TRANSFER, 256, look_ahead)
+        engine.render(view(48, 0), TRANSFER)
+        frames = Frames(engine, view(48, 0), TRANSFER, 144, look_ahead)
         for step in range(1, 25):
-            frames.look_from(view(64, 1.5 * step))
+            frames.look_from(view(48, 1.5 * step))
             hits, stats = frames.frame()
             missed, looked_ahead = missed + stats.misses, looked_ahead + (stats.ahead > 0)
         assert looked_ahead == (0 if look_ahead == 0 else 23 if look_ahead < 8 else 6)
@@ -191,7 +193,7 @@ def missed_on_a_flight(backend: str, look_ahead: float) -> tuple[int, gv.Hits, g
                 break
         engine.validate()
         assert stats.converged
-        expected = engine.render(view(64, 1.5 * step), TRANSFER)
+        expected = engine.render(view(48, 1.5 * step), TRANSFER)
     assert torch.equal(hits.color, expected.color.reshape(-1, 3))
     return missed, hits, stats
 
@@ -230,9 +232,10 @@ def test_what_the_picture_misses_comes_before_what_the_next_ones_will():
 def test_a_tree_deepens_by_many_levels_a_frame(backend, branching, loading):
     """If rays need it: views from afar do not, nor is there more below the last level."""
     device = DEVICES[backend]
+    size, batch = (32, 1024) if loading == "levels" else (64, 2048)
     options = {"brick_pool": "64 MB", "loading": loading, "device": device}
     with gv.Engine(Ball(1024, branching), **options) as engine:
-        frames, depth = Frames(engine, view(64), TRANSFER, 4096), []
+        frames, depth = Frames(engine, view(size), TRANSFER, batch), []
         for _ in range(60):
             _, stats = frames.frame()
             there = engine.cache.nodes.parent_t >= 0
@@ -300,10 +303,10 @@ def flown(
 PATH = [view(96, 1.5 * number) for number in range(61)]
 
 
-def winding(number: int) -> gv.Camera:
+def winding(number: int, size: int) -> gv.Camera:
     """Returns a view of a long flight that sees new parts all the time."""
     height, distance = 50 * math.sin(number / 40), 0.85 + 0.3 * math.cos(number / 90)
-    return gv.Camera.orbit(1.7 * number, height, distance, None, 96, 96)
+    return gv.Camera.orbit(1.7 * number, height, distance, None, size, size)
 
 
 @pytest.mark.parametrize("backend", COMPILED)
@@ -321,7 +324,8 @@ def test_a_long_flight_does_not_wait(blobs, tmp_path, scene, look_ahead, backend
         producer = gv.VolumeProducer(gv.Volume(values), hold="mapped")
     else:
         producer = Ball(1024)
-    path = [winding(number) for number in range(1000 if device == "cuda" else 30)]
+    count, size = (1000, 96) if device == "cuda" else (30, 48)
+    path = [winding(number, size) for number in range(count)]
     with gv.Engine(producer, device=device, **options) as engine:
         replay = recorded(engine, path[0], TRANSFER, batch=64, look_ahead=look_ahead)
         with nobody_waits(device=device):

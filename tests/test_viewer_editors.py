@@ -77,7 +77,7 @@ def test_slices_are_those_of_slice_picture_beside_the_picture(session):
 
 def test_edges_of_a_plane_are_where_the_page_is_told(session):
     """The brightest voxel of the ball is where the edges sent to the page put it."""
-    page = Page(session, 804, 604)
+    page = Page(session, 404, 304)
     page.final()
     middle = [0.65 * 40 - 0.5, 0.5 * 40 - 0.5, 0.4 * 40 - 0.5]
     layout = sliced(page, position=middle)[0]["layout"]
@@ -474,6 +474,16 @@ def test_colours_are_saved_for_paraview(session):
     assert "no transfer function" in page.next("refused", 0)["text"]
 
 
+@pytest.fixture(scope="module")
+def refusing_page():
+    """A page of one view for all presets that are none."""
+    opened = new_session(bright_ball(), FUNCTION, engine={"time_budget": None})
+    page = Page(opened)
+    page.final()
+    yield page
+    opened.close()
+
+
 BOMB = "<!DOCTYPE a [" + "".join(
     f'<!ENTITY e{n} "{f"&e{n - 1};" * 20 if n else "x" * 20}">' for n in range(12)
 )
@@ -494,13 +504,13 @@ BOMB = "<!DOCTYPE a [" + "".join(
         ("a.vp.json", '{"volumeProperties": []}', "a.vp.json"),
     ],
 )
-def test_what_is_no_preset_is_refused_in_a_line(session, file, text, message):
-    page = Page(session)
-    page.final()
+def test_what_is_no_preset_is_refused_in_a_line(refusing_page, file, text, message):
+    page = refusing_page
+    count = len(page.of_type("refused"))
     page.send("read", file=file, text=text)
-    line = page.next("refused", 0)["text"]
+    line = page.next("refused", count)["text"]
     assert message in line and "\n" not in line and "/tmp" not in line and len(line) < 600
-    page.moved(turned_camera(page.camera, 0.1))
+    page.moved(turned_camera(page.camera, 0.1 * (count + 1)))
 
 
 @pytest.mark.parametrize("name", ["mr", "em", "cloud", "galaxy"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 
 import numpy as np
@@ -44,15 +45,19 @@ def all_arguments(
     return (*args, detail, shares, weights, wide)
 
 
+@functools.cache
+def twins_answer(side: int) -> tuple[torch.Tensor, ...]:
+    return voxelize(*cubes(side), weights=True, backend="reference")
+
+
 @pytest.mark.parametrize("side", [1, 3, 8, 10, 16, 20])
 @pytest.mark.parametrize("detail", [0.0, 0.9])
 def test_compiled_is_the_twin_in_every_bit(compiled, side, detail):
     """Also where voxels are searched one by one, as for small triangles."""
-    args = cubes(side, DEVICES[compiled])
-    expected = voxelize(*args, weights=True, backend="reference")
+    args, expected = cubes(side, DEVICES[compiled]), twins_answer(side)
     actual = voxelize(*args, weights=True, detail=detail, backend=compiled)
     for a, b in zip(actual, expected, strict=True):
-        assert torch.equal(a, b)
+        assert torch.equal(a.cpu(), b)
     distance, nearest, winding, coverage, weight = actual
     assert (nearest[3:5] == -1).all() and (distance[3:5] == torch.inf).all()
     assert (winding[4] == 0).all() and (coverage[4] == 0).all()
@@ -85,7 +90,7 @@ def test_triangles_beyond_float32_are_nowhere(backend):
 
 def test_a_large_hierarchy_is_gone_through(compiled):
     """5,000 triangles in five levels of boxes, against brute force."""
-    args = cubes(6, DEVICES[compiled], each=5000)
+    args = cubes(4, DEVICES[compiled], each=5000)
     expected = voxelize(*args, backend="reference")
     for a, b in zip(voxelize(*args, backend=compiled), expected, strict=True):
         assert torch.equal(a, b)
