@@ -47,7 +47,7 @@ infos = st.builds(
 
 
 @settings(
-    max_examples=40,
+    max_examples=18,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )

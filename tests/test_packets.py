@@ -7,7 +7,14 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from helpers.packets import INSTRUCTIONS, LAMP, TRANSFER, result, shaded, start
+from helpers.packets import (
+    INSTRUCTIONS,
+    LAMP,
+    TRANSFER,
+    result,
+    shaded_in_few_steps,
+    start,
+)
 from helpers.rays import camera_rays
 from helpers.traces import trace
 from torch import Tensor
@@ -75,12 +82,15 @@ CASES += [
 
 
 def all_shaded() -> dict[str, list[Tensor]]:
-    return {f"{name} {number}": shaded(SHADERS[name], "cpp", number) for name, number in CASES}
+    return {
+        f"{name} {number}": shaded_in_few_steps(SHADERS[name], "cpp", number)
+        for name, number in CASES
+    }
 
 
 @cache
 def expected(name: str, branching: int) -> list[Tensor]:
-    return shaded(SHADERS[name], "reference", branching)
+    return shaded_in_few_steps(SHADERS[name], "reference", branching)
 
 
 @pytest.fixture(scope="module")
@@ -113,15 +123,23 @@ def check_bits(tree, size: int, shader: gv.Shader, lods=("auto", "finest"), **op
         assert b["color"].unique().numel() >= 20, "the test must see something"
 
 
+OF_ONE_BRICK = [
+    *("plain", "lit", "lit by stored normals"),
+    *("stored colour", "isosurface", "features"),
+]
+
+
 @pytest.mark.backend("cpp")
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int16, torch.float16, torch.float32])
-@pytest.mark.parametrize(
-    "name",
-    ["plain", "lit", "lit by stored normals", "stored colour", "isosurface", "features"],
-)
-@pytest.mark.parametrize("brick", [8, 32], ids=["copied", "not copied"])
-def test_a_pool_of_one_brick_is_read(name, dtype, brick):
-    """It is copied, with room for loads beyond a voxel, if that is little beside the rays."""
+@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("name", OF_ONE_BRICK)
+def test_a_pool_of_one_brick_is_read(name, number):
+    """It is copied, with room for loads beyond a voxel, if that is little beside the rays. Any two
+    of shader, dtype, size of the brick and lod meet.
+    """
+    dtype = (torch.uint8, torch.int16, torch.float16, torch.float32)[number]
+    odd = OF_ONE_BRICK.index(name) % 2
+    brick = (8, 32)[(number + odd) % 2]  # copied, not copied
+    lod = ("auto", "finest")[(number // 2 + odd) % 2]
     numbers = torch.rand((4, 6, 7, 5), generator=torch.Generator().manual_seed(3))
     factor = 1 if dtype.is_floating_point else 1.9
     channels = {"value": numbers[0], "rgba": numbers.movedim(0, -1), "normal": numbers[:3]}
@@ -129,7 +147,7 @@ def test_a_pool_of_one_brick_is_read(name, dtype, brick):
     volumes = {key: gv.Volume((some * factor).to(dtype)) for key, some in channels.items()}
     tree = gv.N3Tree.from_volume(volumes, brick)
     assert tree.bricks.capacity == 1
-    check_bits(tree, 9, SHADERS[name])
+    check_bits(tree, 9, SHADERS[name], lods=(lod,))
 
 
 @pytest.mark.backend("cpp")

@@ -64,13 +64,14 @@ LAMP = gv.PointLight((10.0, 50.0, 30.0))
 
 
 @cache
-def scene(branching: int = 2) -> gv.N3Tree:
+def scene(branching: int = 2, side: int = 37) -> gv.N3Tree:
     """Returns a tree of rough and smooth values, with a region of zeros and a constant one."""
+    part = side / 37
     generator = torch.Generator().manual_seed(4)
     coarse = torch.rand((1, 5, 12, 12, 12), generator=generator)
-    numbers = torch.nn.functional.interpolate(coarse, size=(37, 37, 37), mode="trilinear")[0]
-    value = numbers[4] + 0.1 * torch.rand((37, 37, 37), generator=generator)
-    value[:14, :, :], value[:, 24:, :20] = 0.0, 0.35
+    numbers = torch.nn.functional.interpolate(coarse, size=(side,) * 3, mode="trilinear")[0]
+    value = numbers[4] + 0.1 * torch.rand((side,) * 3, generator=generator)
+    value[: round(14 * part)], value[:, round(24 * part) :, : round(20 * part)] = 0.0, 0.35
     rgba = numbers[:4].movedim(0, -1).clone()
     rgba[..., 3] *= 0.3 * (value > 0.2)
     normal = torch.nn.functional.normalize(numbers[:3].movedim(0, -1) - 0.5, dim=-1)
@@ -89,10 +90,10 @@ def scene(branching: int = 2) -> gv.N3Tree:
     )
 
 
-def cut_rays(rays: gv.Rays) -> gv.Rays:
+def cut_rays(rays: gv.Rays, side: int = 37) -> gv.Rays:
     """Returns rays that begin and end within the box, each elsewhere, with reduced light."""
     first = torch.linspace(30.0, 45.0, len(rays.origin), dtype=torch.float64)
-    limits = torch.stack((first, first + 17.3), 1)
+    limits = torch.stack((first, first + 17.3), 1) * (side / 37)
     return replace(rays, range=limits, transmittance=torch.linspace(0.05, 1.0, len(first)).double())
 
 
@@ -117,13 +118,41 @@ def shaded(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
         (tree, 11, {"stop_alpha": 0.6, "depth_alpha": 0.5}),
         (holes, 14, {}),
     ]
-    if getattr(shader, "shadows", False):  # the twin traces a cone from each sample, step by step
-        pictures = [(tree, 21, {"step": 2.6}), (holes, 14, {"lod": "finest", "step": 3.9})]
     for traced_tree, size, options in pictures:
         rays = camera_rays(traced_tree, size, distance=1.5)
         cut = cut_rays(rays)
-        # Most in one call: what the twin takes depends on the longest ray, not on their number.
         for traced_rays in (rays, cut) if size < 10 else (joined_rays(rays, cut),):
-            hits, marks = trace(traced_tree, backend, traced_rays, shader, **options)
-            results += [*hits.values(), *marks.values()]
+            results += written(traced_tree, backend, traced_rays, shader, **options)
+    return results
+
+
+def written(tree: gv.N3Tree, backend: str, rays: gv.Rays, shader, **options) -> list[Tensor]:
+    hits, marks = trace(tree, backend, rays, shader, **options)
+    return [*hits.values(), *marks.values()]
+
+
+def shaded_in_few_steps(shader: gv.Shader, backend: str, branching: int = 2) -> list[Tensor]:
+    """Returns everything that a shader's traces write. The time of the twin is that of its steps,
+    hardly that of its rays: therefore whole rays have long steps, and some cut ones short steps.
+    """
+    side = 23 if branching == 2 else 37
+    tree = scene(branching, side)
+    holes = with_holes(tree, 0.3, 5)
+    pictures = [
+        (tree, 21, {"step": 2.1}),
+        (tree, 5, {"step": 0.8}),  # cones as wide as several voxels: levels blend
+        (tree, 11, {"lod": "finest", "step": 2.6}),
+        (holes, 14, {"step": 1.7, "stop_alpha": 0.6, "depth_alpha": 0.5}),
+    ]
+    if shadows := getattr(shader, "shadows", False):  # the twin traces a cone from each sample
+        pictures = [(tree, 21, {"step": 2.6}), (holes, 14, {"lod": "finest", "step": 3.9})]
+    results = []
+    for traced_tree, size, options in pictures:
+        rays = camera_rays(traced_tree, size, distance=1.5)
+        joined = joined_rays(rays, cut_rays(rays, side))
+        results += written(traced_tree, backend, joined, shader, **options)
+    if not shadows:
+        cut = cut_rays(camera_rays(tree, 9, distance=1.5), side)
+        short = torch.stack((cut.range[:, 0], cut.range[:, 0] + 4.2), 1)
+        results += written(tree, backend, replace(cut, range=short), shader)
     return results
