@@ -26,7 +26,7 @@ from gvtorch.io.stores.conversion import convert
 from gvtorch.pool import staging
 
 COMPILED = [pytest.param(b, marks=pytest.mark.backend(b)) for b in ("cpp", "cuda")]
-FRAMES = int(os.environ.get("GVTORCH_SOAK", "2000"))
+FRAMES = int(os.environ.get("GVTORCH_SOAK", "1000"))
 LOOK = gv.TransferFunction.preset("gray", 0, 1)
 FAULTS = ("raises", "nan", "errors", "never")
 
