@@ -10,7 +10,7 @@ from helpers import ROOT
 from helpers.browser import Tab
 from helpers.labels import cells
 from helpers.stores import noise
-from helpers.viewer import BANDS, Grown, Page
+from helpers.viewer import BANDS, TIMEOUT, Grown, Page
 
 import gvtorch as gv
 from gvtorch.io.stores.conversion import convert
@@ -202,7 +202,8 @@ def test_time_is_slid_and_played(chromium, beat):
 def test_a_clock_has_a_slider(chromium):
     producer = gv.FieldProducer(Grown(), 32, box=((-10, -10, -10), (10, 10, 10)))
     function = gv.TransferFunction([(0.4, 0), (0.6, 1)])
-    with gv.view(producer, function, browser=False, wait=False) as viewer:
+    state = gv.ViewState(shader=function, develop=Development(samples=1))
+    with gv.view(producer, state=state, browser=False, wait=False) as viewer:
         tab = Tab(chromium, viewer.url)
         tab.until("app?.state")
         before = (tab.final() > 100).sum()
@@ -481,7 +482,7 @@ def test_every_control_of_every_shader_is_touched(tab, viewer):
     value = tab.page.locator("label.gv-row:has(> span:text-is('value')) input").first
     value.fill("123.5")
     value.press("Enter")
-    tab.until(lambda: viewer.session.ask(lambda: viewer.state.shader).value == 123.5)
+    tab.until(lambda: viewer.session.ask(lambda: viewer.state.shader, TIMEOUT).value == 123.5)
 
 
 # Chooses every shader, then the options of each list (of other lists than the shader's: the last),

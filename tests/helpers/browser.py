@@ -11,16 +11,10 @@ import numpy as np
 
 from gvtorch.bench.browser import chromium_path, running_chromium, why_no_browser
 
+from . import slowness
 from .viewer import TIMEOUT
 
 __all__ = ["Tab", "chromium_path", "running_chromium", "why_no_browser"]
-
-
-def slowness() -> float:
-    """How many times longer than usual this machine takes at the moment, from 1 to 10."""
-    start = time.perf_counter()
-    sum(range(200_000))
-    return min(max((time.perf_counter() - start) / 0.004, 1.0), 10.0)
 
 
 class Tab:

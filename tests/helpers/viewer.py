@@ -16,7 +16,7 @@ import torch
 import gvtorch as gv
 from gvtorch.viewer.session import Session
 
-TIMEOUT = 60.0  # time limit in seconds for an answer, on the slowest machine
+TIMEOUT = 300.0  # time limit in seconds for an answer, on the slowest machine
 
 
 class Page:

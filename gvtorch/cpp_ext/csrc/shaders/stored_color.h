@@ -107,8 +107,12 @@ struct StoredColor : ShaderFacts {
     };
     const Row<V> row{color(seen.red), color(seen.green), color(seen.blue),
                      stretch(opacity, interval.length / numbers().reference_length)};
-    if (numbers().lit > 0) return light.add(shown, row, probe, interval, sum, shadow...);
-    sum.add(row, interval, shown);
+    if (numbers().lit > 0) {
+      const MaskOf<V> absorbs = shown && row.alpha > 0;  // alpha rounds to 0 if the interval is short
+      if (any(absorbs)) light.add(absorbs, row, probe, interval, sum, shadow...);
+    } else {
+      sum.add(row, interval, shown);
+    }
   }
   // A packet's colours by direction: a call, which keeps the loop of other colours as fast as without these.
   template <class V, class AnyProbe, class... Shadow>
