@@ -12,7 +12,7 @@ import torch
 from helpers import DEVICES
 from helpers.clips import CLIPS, is_kept
 from helpers.marcher import trilinear
-from helpers.rays import camera_rays
+from helpers.rays import camera_rays, rays_of_cameras
 from helpers.shaders import SHADERS
 from helpers.traces import SHADER, assert_equal, trace
 from helpers.trees import with_holes
@@ -52,14 +52,10 @@ def narrowing(rays: gv.Rays, near: float, end: float) -> gv.Rays:
 )
 def test_narrowing_cones_equal_the_reference(blobs, compiled, branching, near, end, dtype):
     tree = gv.N3Tree.from_volume(blobs, 4, branching=branching)
-    near_by, afar = (camera_rays(tree, distance=distance) for distance in (0.3, 1.3))
-    both = {
-        name: torch.cat((getattr(near_by, name), getattr(afar, name)))
-        for name in ("origin", "direction", "cone", "range")
-    }  # beyond `end` a cone is as one of width 0
-    rays = narrowing(gv.Rays(**both, width=afar.width), near, end)
+    both = rays_of_cameras(tree, 24, 0.3, 1.3)
+    rays = narrowing(both, near, end)  # beyond `end` a cone is as one of width 0
     result, marks, _ = assert_equal(tree, compiled, rays, dtype=dtype)
-    assert result["alpha"][len(afar.origin) :].max() > 0.2 and (marks["brick"] == 1).any()
+    assert result["alpha"][24 * 24 :].max() > 0.2 and (marks["brick"] == 1).any()
 
 
 @pytest.mark.parametrize("seed", range(3))

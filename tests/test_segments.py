@@ -9,7 +9,7 @@ import math
 import pytest
 import torch
 from helpers import DEVICES
-from helpers.rays import camera_rays
+from helpers.rays import camera_rays, rays_of_cameras
 from helpers.traces import SHADER, arguments, changed, packed
 from helpers.trees import copy_to, with_holes
 from hypothesis import given, settings
@@ -52,16 +52,6 @@ LISTED = ("ray_index", "node", "brick", "depth", "interval", "distance")
 NEAR_AND_FAR = (0.2, 1.3, 6.0)
 
 
-def rays_from(tree, size=24) -> gv.Rays:
-    """Returns rays of cameras at `NEAR_AND_FAR`, one after another: the twin takes as many steps
-    for all of them as for the longest.
-    """
-    parts = [camera_rays(tree, size, distance=distance) for distance in NEAR_AND_FAR]
-    names = ("origin", "direction", "cone", "range")
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-    return gv.Rays(**columns, width=size)
-
-
 def tensors(segments) -> dict[str, torch.Tensor]:
     return {name: value.cpu() for name, value in segments._asdict().items()}
 
@@ -92,7 +82,7 @@ def assert_same_walk(tree, compiled, rays, *, hides=True, limit=0, by_node=False
 )
 def test_compiled_equals_reference(blobs, compiled, brick_size, branching, lod, hides):
     tree = gv.N3Tree.from_volume(blobs, brick_size, branching=branching)
-    rays = rays_from(tree)
+    rays = rays_of_cameras(tree, 24, *NEAR_AND_FAR)
     for limit in (5, 0):
         result = assert_same_walk(tree, compiled, rays, lod=lod, hides=hides, limit=limit)
     samples = result["counts"][:, 1].view(3, -1).sum(1)
@@ -134,7 +124,7 @@ def test_missing_nodes_give_equal_segments_and_requests(
 def test_segments_are_what_trace_rays_samples(blobs, backend, lod):
     """Same number of samples, same marks, same requests, in a tree with missing parts."""
     tree = with_holes(gv.N3Tree.from_volume(blobs, 4), 0.3, 7)
-    rays = rays_from(tree)
+    rays = rays_of_cameras(tree, 24, *NEAR_AND_FAR)
     ray_args, drawn = tracing(tree, backend, rays, stop_alpha=1.0, lod=lod)
     haze = gv.TransferFunction.from_points([(0, 0), (0.2, 0), (1, 0.1)])  # nothing is opaque
     sampling = Sampling(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import DEVICES, ROOT
-from helpers.rays import camera_rays, rays_along, world_rays
+from helpers.rays import camera_rays, rays_along, rays_of_cameras, world_rays
 from helpers.shaders import POINT, SHADERS
 from helpers.traces import SHADER, assert_equal, changed, op_arguments, trace
 from helpers.trees import copy_to, with_holes
@@ -64,16 +64,6 @@ def with_and_without_ranges(
             ranges[:, :, 0], ranges[:, :, 1] = ranged.bricks.channels[channel].limits
         pairs[threshold] = ranged, unknown
     return pairs
-
-
-def rays_of_cameras(tree, size: int, *distances: float) -> gv.Rays:
-    """Returns the rays of several cameras: what the twin takes depends on the longest ray, not on
-    their number.
-    """
-    cameras = [camera_rays(tree, size, distance=distance) for distance in distances]
-    names = ("origin", "direction", "cone", "range")
-    columns = {name: torch.cat([getattr(rays, name) for rays in cameras]) for name in names}
-    return gv.Rays(**columns, width=cameras[0].width)
 
 
 @pytest.mark.parametrize("lod", ["finest", "auto"])

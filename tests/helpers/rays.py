@@ -29,6 +29,16 @@ def camera_rays(tree, size=24, **options):
     return gv.Camera.orbit(width=size, height=size, **options).placed(tree.box).rays()
 
 
+def rays_of_cameras(tree, size: int, *distances: float) -> gv.Rays:
+    """Returns the rays of cameras at several distances, one camera's after another's: what the twin
+    takes depends on the longest ray, not on their number.
+    """
+    cameras = [camera_rays(tree, size, distance=distance) for distance in distances]
+    names = ("origin", "direction", "cone", "range")
+    columns = {name: torch.cat([getattr(rays, name) for rays in cameras]) for name in names}
+    return gv.Rays(**columns, width=size)
+
+
 def world_rays(tree_box, count: int, device) -> tuple[torch.Tensor, ...]:
     camera = gv.Camera.orbit(width=count // 3, height=3, distance=1.2).placed(tree_box)
     rays = camera.rays()

@@ -115,7 +115,7 @@ class Tree:
         absent = torch.full_like(node, -1)
         descent = Descent(node, zero, absent, hides(node), absent, zero, absent, zero)
         active = torch.ones_like(node, dtype=torch.bool)
-        for depth in itertools.count():  # of all that go on
+        for depth in itertools.count():  # all nodes that are still active have this depth
             goes_deeper = wanted > depth
             args.stamp_t[descent.node[active] // self.per_tile] = args.frame_1[0]
             has_data = active & (self.brick_n[descent.node] != ABSENT)
