@@ -409,6 +409,7 @@ def flight(seed: int, volume: gv.Volume, tree: gv.N3Tree, device: torch.device) 
         return picture.stats.converged, evicted
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backend", COMPILED)
 def test_random_flights_end_in_the_resident_picture(backend):
     volume, device = world(), DEVICES[backend]

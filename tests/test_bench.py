@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -58,6 +59,7 @@ def figures(value) -> list[float]:
 @pytest.mark.parametrize("name", bench.WORKLOADS)
 def test_a_workload_gives_finite_figures_as_json(name, compiled, monkeypatch, quick):
     monkeypatch.setenv("CXX", quick)
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))  # saves minutes
     device = torch.device(DEVICES[compiled])
     chosen = Settings(device=device, peers=("grid_sample", "zarr", "tensorstore"), **QUICK)
     content = json.loads(json.dumps(bench.run(name, chosen).as_dict(), allow_nan=False))
@@ -234,6 +236,7 @@ def test_the_command_lists_and_names_mistakes():
         assert len(run.stderr.strip().splitlines()) == 1 and not run.stdout
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_the_command_prints_json_and_plots_write_the_page(tmp_path):
     run = gvtorch("bench", "lru", "--quick", "--repeats", 1, "--json", "-o", tmp_path)
@@ -258,6 +261,7 @@ def test_the_command_prints_json_and_plots_write_the_page(tmp_path):
     assert (tmp_path / "lru.png").exists() == ("(lru.png)" in text)
 
 
+@pytest.mark.long
 @pytest.mark.backend("browser")
 def test_a_hand_in_a_browser_sees_its_jump(chromium, viewer):
     """Pictures arrive while the mouse drags, and one that shows the jump of the pointer."""

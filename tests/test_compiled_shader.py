@@ -286,6 +286,7 @@ def in_processes(folder: Path, count: int, given: Path) -> list[float]:
     return [result(run) for run in runs]
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_library_is_kept_by_content_and_two_processes_may_make_it(tmp_path, monkeypatch, quick):
     """The compiler counts its calls: two processes at once make one library, a third makes none;

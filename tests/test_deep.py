@@ -135,6 +135,7 @@ def test_a_sponge_is_cut_as_whole_numbers_tell():
     assert (error < 0.1).float().mean() > 0.75, error.quantile(0.75)
 
 
+@pytest.mark.long
 def test_a_fractal_is_the_same_in_float64():
     up = torch.tensor([0.3, -0.4, 0.86], dtype=torch.float64)
     up = up / up.norm()

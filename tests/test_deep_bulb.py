@@ -115,6 +115,7 @@ def test_a_picture_from_near_is_that_of_the_formula(bulb, level):
     seen_from_near(*bulb, level, 16)
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_flight_through_all_levels_is_that_of_the_formula():
     """From 2^-4 to 2^-30 of the box, with a pool that holds a part of what is seen on the way, and

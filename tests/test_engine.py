@@ -381,6 +381,7 @@ def test_pools_are_honoured_to_the_byte():
         assert total == sum(memory.values())
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_wandering_camera_leaves_memory_flat(blobs):
     """After 400 frames nothing has piled up, and the pools are valid."""

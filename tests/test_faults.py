@@ -196,6 +196,7 @@ def test_reads_that_fail_cost_their_nodes_alone(tmp_path, kind):
     assert failed > 2
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_frame_that_finds_no_memory_leaves_the_pools_in_order(blobs):
     """In one engine each tensor operation fails in turn; the next frames equal those of a faultless

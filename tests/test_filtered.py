@@ -54,6 +54,7 @@ def shaded(backend: str) -> list[torch.Tensor]:
     return results
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_every_bit_is_the_same_for_all_instruction_sets(tmp_path):
     expected = shaded("reference")
@@ -152,6 +153,7 @@ def test_a_solid_ball_covers_a_disc_from_afar(direction, growths):
         assert abs(float(covered) / (math.pi * (radius / pixel) ** 2) - 1) < grown, pixel
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("directions", "counts"), [(True, [40]), (False, [1, 300])])
 def test_colours_are_the_same_whatever_is_worked_out_at_a_time(monkeypatch, directions, counts):
     def colors() -> torch.Tensor:

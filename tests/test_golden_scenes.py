@@ -256,6 +256,7 @@ def test_every_bit_is_as_it_was(backend, group):
     assert not wrong, f"{len(wrong)} of {tried} scenes changed:\n" + "\n".join(wrong)
 
 
+@pytest.mark.long
 def test_the_default_device_of_torch_changes_no_bit(backend):
     """A program may make its own tensors elsewhere."""
     seeds = [seed for seed in range(0, SCENES, 6) if promised(settings(seed), backend)]

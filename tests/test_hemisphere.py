@@ -82,6 +82,7 @@ def monte_carlo(kind: str, frames: int = 16, count: int = 32) -> Tensor:
     return total / frames / count
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", LOOKS)
 def test_refined_pictures_converge_to_monte_carlo(compiled, kind):
     """Equal directions in all pixels and frames would leave errors of 0.046 and 0.029 after 32

@@ -100,6 +100,7 @@ def forged(content: dict[str, bytes]) -> dict[str, bytes]:
     return files
 
 
+@pytest.mark.long
 def test_forged_pictures_are_refused_in_a_line(tmp_path):
     """A PNG of 69 bytes once ended the process, a ZIP as NPY gave a traceback, an EXR 3 lines."""
     whole = honest(tmp_path)

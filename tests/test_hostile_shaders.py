@@ -58,6 +58,7 @@ def test_a_compiler_s_name_may_be_blank_and_must_end_its_quotes(monkeypatch):
         user.load_op(HEADER, "mine::Plain")
 
 
+@pytest.mark.long
 def test_an_unknown_instruction_set_is_told(monkeypatch):
     monkeypatch.setenv("GVTORCH_CPU", "avx3")
     code = "from gvtorch import cpp_ext; print(cpp_ext.instructions())"

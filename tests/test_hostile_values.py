@@ -307,6 +307,7 @@ def _as_anybody() -> None:
         ctypes.CDLL(None).prctl(24, right, 0, 0, 0)  # PR_CAPBSET_DROP
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="rights of root are Linux's")
 def test_a_folder_that_may_not_be_written_is_one_line_of_every_command(tmp_path, small):
     np.savez(tmp_path / "p.npz", positions=np.random.default_rng(1).random((50, 3)))

@@ -70,6 +70,7 @@ def lab(tmp_path: Path) -> Iterator[str]:
         server.wait()
 
 
+@pytest.mark.long
 def test_a_cell_shows_the_live_page(chromium, lab):
     tab = Tab(chromium, lab, viewport={"width": 1200, "height": 900})
     try:

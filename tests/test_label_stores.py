@@ -50,6 +50,7 @@ def test_a_store_keeps_labels(tmp_path, kind):
     same_as_resident(store, volume)
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_store_of_more_labels_than_16_bits_count_by_processes(tmp_path):
     data = np.random.default_rng(0).integers(0, 80_000, (150, 140, 130)) * 2**40 + 5

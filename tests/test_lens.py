@@ -107,6 +107,7 @@ def test_moderate_blur_agrees_with_64_rays_through_the_lens(opacity, aperture):
     assert expected.max() > 0.15, "the test must see something"
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_stored_colours_blur_as_a_lens_does_where_matter_is_opaque():
     """Only stored colours, because a transfer function of mean densities gives other colours."""

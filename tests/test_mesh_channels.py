@@ -175,6 +175,7 @@ def test_what_another_converter_has_begun_stays(tmp_path, mesh, manifest, channe
     assert begun.read_text() == "{}"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="kills a process")
 def test_a_killed_voxelization_goes_on_and_is_the_same(tmp_path):
     trimesh = pytest.importorskip("trimesh", reason="trimesh is not installed")

@@ -459,6 +459,7 @@ def test_a_store_holds_the_voxels_and_their_means(tmp_path, torus_file, channel)
     assert opened.info.labels == (channel == "material")
 
 
+@pytest.mark.long
 def test_a_mesh_in_memory_goes_to_worker_processes(tmp_path):
     mesh = meshes.sphere(3)
     store = gv.voxelize(mesh, tmp_path / "a.zarr", resolution=300, workers=2)

@@ -137,6 +137,7 @@ def test_fillings_have_the_colours_around_them():
     assert (closed.material == 1).all() and len(closed.faces) > len(ball.faces)
 
 
+@pytest.mark.long
 def test_the_bunny_s_inside_is_where_libigl_winds_around_it():
     """The filled bunny is compared with igl's winding number of the open one, and its volume with
     that of a published closed bunny.

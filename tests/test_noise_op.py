@@ -67,6 +67,7 @@ def digests(backend: str = "cpp") -> list[int]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.backend("cpp")
 def test_all_instruction_sets_give_the_same_bits(instructions, tmp_path):

@@ -35,6 +35,7 @@ def cache(tmp_path, monkeypatch) -> Path:
     return tmp_path / "cache" / "shaders"
 
 
+@pytest.mark.long
 def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, cache, monkeypatch):
     """A file that is included by a macro, and only in CUDA code."""
     folder = tmp_path / "a b;touch $(touch beside)`touch beside`"
@@ -60,6 +61,7 @@ def test_what_only_cuda_includes_counts_and_no_name_comes_to_a_shell(tmp_path, c
     assert not [file for file in tmp_path.rglob("*") if file.name in ("beside", "here")]
 
 
+@pytest.mark.long
 def test_what_nvcc_says_names_the_file(tmp_path, cache):
     header = write_header(tmp_path, "  int broken = nothing;")
     with pytest.raises(user.CompileError, match="did not compile for CUDA") as caught:

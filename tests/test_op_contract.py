@@ -157,6 +157,7 @@ def test_memory_stays_safe_without_the_python_checks(blobs, compiled):
             torch.ops.gvtorch.trace_rays(*{**good, name: value}.values())
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_cpp_process_without_python_loads_the_archive(blobs, tmp_path):
     """Compiles tests/cpp/render.cpp against libtorch only, and compares what it prints."""

@@ -141,6 +141,7 @@ def test_every_command_takes_any_path(tmp_path, data, name, monkeypatch, capsys)
     capsys.readouterr()
 
 
+@pytest.mark.long
 def test_links_to_names_that_are_no_text_go_with_the_process(tmp_path, data):
     """In a separate process and its workers, which print to a terminal that can't show bytes."""
     bad = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.zarr")

@@ -280,6 +280,7 @@ def test_a_splat_that_fails_leaves_what_another_process_has_in_the_folder(tmp_pa
         assert lock.exists() == begun and (tmp_path / "a.zarr").exists() == begun
 
 
+@pytest.mark.long
 def test_points_in_memory_go_to_worker_processes(tmp_path):
     store = gv.splat(gv.Points(PLACE, MASS), tmp_path / "a.zarr", extent=300, workers=2)
     total = store.read_region(0, (0, 0, 0), store.extent[::-1]).sum(dtype=np.float64)

@@ -36,6 +36,7 @@ def total_light(producer, engine, away, position) -> np.ndarray:
     return total
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize(
     "position", [(0.0156, 0.0156, 0.0156), (0.27, -0.11, 0.003), (0.5, 0.49, -0.3)]

@@ -264,6 +264,7 @@ print(peak() - before)
 """
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_memory_is_bounded_whatever_the_size(tmp_path):
     """The layers of 2048^2 pixels alone would take 100 MB."""

@@ -172,6 +172,7 @@ print(len(made), root.sum() * 8 ** (made.grid.levels - 1))
 """
 
 
+@pytest.mark.long
 def test_ten_million_points_are_sorted_in_little_memory(tmp_path):
     command = [sys.executable, "-c", _CHILD, str(tmp_path / "a.points")]
     run = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)

@@ -130,6 +130,7 @@ def splatted() -> Tensor:
     return splat(*random_arguments(), backend="cpp")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("instructions", ["baseline", "avx2"])
 @pytest.mark.backend("cpp")
 def test_all_instruction_sets_give_the_same_bits(instructions, tmp_path):

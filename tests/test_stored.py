@@ -327,6 +327,7 @@ def test_a_foreign_image_is_streamed_as_well(tmp_path, cloud):
     assert (pictures[0].color - resident.color).abs().max() < 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
     """A generated volume of 1 GiB, converted in less than 2 GB: pools of a sixteenth give the same

@@ -320,6 +320,7 @@ print(size.triangles, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - befo
 """
 
 
+@pytest.mark.long
 def test_memory_is_that_of_blocks_not_of_the_surface(tmp_path):
     command = [sys.executable, "-c", MEASURE]
     run = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)

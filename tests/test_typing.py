@@ -38,6 +38,7 @@ follow_imports = normal
 """
 
 
+@pytest.mark.long
 def test_a_strict_project_sees_the_types(tmp_path):
     pytest.importorskip("mypy")
     site = tmp_path / "venv" / "lib" / f"python3.{sys.version_info.minor}" / "site-packages"

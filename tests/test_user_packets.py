@@ -77,6 +77,7 @@ def all_given() -> dict[str, list[Tensor]]:
     return results
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 @pytest.mark.parametrize("set_", INSTRUCTIONS)
 def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_):

@@ -466,6 +466,7 @@ TOUCH = """() => {
 }"""
 
 
+@pytest.mark.long
 def test_every_control_of_every_shader_is_touched(tab, viewer):
     """Each control sends the value that it shows: no code of the page fails; and a number that is
     typed where there is no slider is accepted.
