@@ -41,8 +41,9 @@ _left_out: Counter[str] = Counter()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The process that starts the others finds out whether the machine is starved of its processor:
-    as on a host that is shared with many, where all tests would take hours.
+    """The process that starts the others finds out whether the machine is starved of its processor,
+    as on a host that is shared with many: all tests would take hours there. Those that are named
+    in the call always run.
     """
     config.addinivalue_line(
         "markers",
@@ -51,9 +52,9 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "long: left out on a machine that is starved, see _STARVED")
     if "GVTORCH_WHOLE" not in os.environ:
         times = min(slowness() for _ in range(20))
-        os.environ["GVTORCH_WHOLE"] = f"0: this machine takes {times:.1f} times as long as usual"
-        if times < 2:
-            os.environ["GVTORCH_WHOLE"] = "1"
+        starved = times >= 2 and config.args == ["tests"]
+        reason = f"this machine takes {times:.1f} times as long as usual"
+        os.environ["GVTORCH_WHOLE"] = f"0: {reason}" if starved else "1"
 
 
 @pytest.hookimpl(wrapper=True)
@@ -93,8 +94,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _thin_out(items: list[pytest.Item]) -> None:
-    """Leaves out the long tests, whose subject shorter ones have too, and half of the cases of each
-    test that has six or more on this machine, chosen by their names.
+    """Leaves out the tests marked as long, which take minutes on such a machine, and half of the
+    cases of each test that has six or more, chosen by their names.
     """
 
     def runs_here(item: pytest.Item) -> bool:
