@@ -11,7 +11,7 @@
 # Torch is pinned in pyproject.toml ([build-system] requires) and nowhere else, the rest in .ci/constraints.txt.
 
 # What is compiled is compiled while packages are being installed.
-MAKEFLAGS += -j3
+MAKEFLAGS += -j4
 PYTHON ?= python3
 VENV := .venv
 COMMA := ,
@@ -123,7 +123,11 @@ $(PACKETS): $(SOURCES) $(COMPILE)
 	$(PYTHON) gvtorch/cpp_ext/libraries.py packets
 	@touch $@
 
-$(VENV)/cpu: $(VENV)/torch $(PACKETS)
+$(VENV)/objects: $(VENV)/torch $(SOURCES) $(COMPILE)
+	$(BIN)/python gvtorch/cpp_ext/libraries.py objects
+	@touch $@
+
+$(VENV)/cpu: $(VENV)/objects $(PACKETS)
 	$(BIN)/python gvtorch/cpp_ext/libraries.py cpu
 	@touch $@
 

@@ -3,9 +3,10 @@ wheel serves every Python >= 3.11 and every torch >= 2.11. The CUDA library is b
 found and is loaded only where torch has CUDA.
 
 Run as a program, this file compiles them in the source tree: both, or with the word cpu or cuda
-one, or with the word packets only the CPU's objects that need nothing of torch, so that any Python
-can do so while torch is still being installed. It runs before gvtorch is installed, so it imports
-nothing of gvtorch and runs compilers.py by its path.
+one. With the word packets it compiles only the CPU's objects that need nothing of torch, so that
+any Python can do so while torch is still being installed; with the word objects the CPU's others,
+one after the other, while the packets are being compiled. It runs before gvtorch is installed, so
+it imports nothing of gvtorch and runs compilers.py by its path.
 
 Environment:
     GVTORCH_CUDA        auto (default: build when nvcc is found), 0 (never), 1 (fail without nvcc)
@@ -72,16 +73,22 @@ def packet_commands(output: Path) -> dict[Path, list[str]]:
     }
 
 
+def object_commands(output: Path) -> dict[Path, list[str]]:
+    """Returns the same of the CPU's other objects, which need torch's headers."""
+    include, _ = compilers.torch_flags()
+    flags = (["-DGV_X86"] if _is_x86() else []) + include
+    return {
+        output / f"{name}.o": _compile(name, output / f"{name}.o", flags)
+        for name in ("cpu_rays", "cpu_segments", "cpu")
+    }
+
+
 def commands(output: Path) -> dict[Path, list[list[str]]]:
     """Returns the compiler calls of each library, by the library's path under `output`; all but the
     last, which links, may run in parallel.
     """
     include, link = compilers.torch_flags()
-    flags = (["-DGV_X86"] if _is_x86() else []) + include
-    objects = {
-        output / f"{name}.o": _compile(name, output / f"{name}.o", flags)
-        for name in ("cpu_rays", "cpu_segments", "cpu")
-    } | packet_commands(output)
+    objects = object_commands(output) | packet_commands(output)
     link_call = [*compilers.find_cxx(), *map(str, objects), "-Wl,--no-as-needed", *link, "-pthread"]
     calls = {output / "libgvtorch_cpu.so": [*objects.values(), link_call]}
     nvcc = chosen_nvcc()
@@ -116,11 +123,11 @@ def compile_libraries(output: Path, kind: str = "") -> list[Path]:
     return list(calls)
 
 
-def compile_packets(output: Path) -> None:
-    """Compiles, in parallel, the packets' objects that are missing or out of date."""
+def compile_objects(output: Path, calls: dict[Path, list[str]], jobs: int) -> None:
+    """Compiles, `jobs` at a time, the objects that are missing or out of date."""
     output.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(partial(_make, _source_digest()), packet_commands(output).values()))
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(partial(_make, _source_digest()), calls.values()))
 
 
 def _is_x86() -> bool:
@@ -157,7 +164,10 @@ def _run(call: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["packets"]:
-        compile_packets(FOLDER / "lib")
+    target, words = FOLDER / "lib", sys.argv[1:]
+    if words == ["packets"]:
+        compile_objects(target, packet_commands(target), os.cpu_count() or 1)
+    elif words == ["objects"]:
+        compile_objects(target, object_commands(target), 1)
     else:
-        compile_libraries(FOLDER / "lib", *sys.argv[1:])
+        compile_libraries(target, *words)
