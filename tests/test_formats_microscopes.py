@@ -87,6 +87,7 @@ def test_colors_of_czi(tmp_path):
     assert [channel.name for channel in volume.info.channels] == ["red", "green", "blue"]
 
 
+@pytest.mark.long
 def test_broken_czi_gives_one_line(tmp_path, five):
     assert_robust(write_czi(tmp_path / "a.czi", five), tmp_path / "broken")
 

@@ -96,6 +96,7 @@ def test_every_bit_is_that_of_rays_one_by_one(tmp_path, monkeypatch, quick, set_
         assert sum(len(a.unique()) for a in tensors) > 1000, "the test must see something"
 
 
+@pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_packets_go_in_float32_and_rays_in_float64(tmp_path, monkeypatch, quick):
     """The usual library contains the packet code, that of this file's ray-by-ray header does not;

@@ -442,6 +442,7 @@ def test_a_field_keeps_what_is_typed_while_the_view_changes(tab, viewer):
         tab.until(lambda size=size: step.input_value() == str(size + 0.125))
 
 
+@pytest.mark.long
 def test_every_shader_becomes_every_other(tab):
     """Common fields are kept; fields that only share a name are not."""
     row = tab.page.locator("label.gv-row:has(> span:text-is('shader')) select")
