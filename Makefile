@@ -123,6 +123,7 @@ $(PACKETS): $(SOURCES) $(COMPILE)
 	$(PYTHON) gvtorch/cpp_ext/libraries.py packets
 	@touch $@
 
+# These need torch, and are compiled while the last packets still are.
 $(VENV)/objects: $(VENV)/torch $(SOURCES) $(COMPILE)
 	$(BIN)/python gvtorch/cpp_ext/libraries.py objects
 	@touch $@

@@ -32,18 +32,19 @@ from helpers.viewer import BANDS, FUNCTION, bright_ball  # noqa: E402
 
 _REQUIRED = os.environ.get("GVTORCH_REQUIRE", "")
 _FIRST = ("test_user_packets.py", "test_stored.py", "test_soak.py", "test_viewer_hands.py")
-#: The reason of skips begins like this where the machine is so slow that tests are left out, which
-#: the summary tells; GVTORCH_WHOLE=1 runs all of them, GVTORCH_WHOLE=0 leaves them out.
-_STARVED = "left out"
+#: On a machine that is starved of its processor a part of the tests is skipped, for a reason that
+#: begins like this; the summary counts them. GVTORCH_WHOLE=1 runs all tests, GVTORCH_WHOLE=0 the
+#: part on any machine. Where it is not set, `pytest_configure` sets it, for all processes of a run.
+_STARVED = "left out: "
 _ran: Counter[str] = Counter()
 _absent: set[str] = set()
 _left_out: Counter[str] = Counter()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The process that starts the others finds out whether the machine is starved of its processor,
-    as on a host that is shared with many: all tests would take hours there. Those that are named
-    in the call always run.
+    """Registers the markers. Finds out whether the machine is starved of its processor, as on a
+    host that is shared with many: all tests would take hours there. Tests that are named in the
+    call always run.
     """
     config.addinivalue_line(
         "markers",
@@ -102,7 +103,7 @@ def _thin_out(items: list[pytest.Item]) -> None:
         return "cuda" not in _devices(item) or not unavailable()["cuda"]
 
     cases = Counter(item.nodeid.partition("[")[0] for item in items if runs_here(item))
-    reason = f"{_STARVED}: {os.environ['GVTORCH_WHOLE'].partition(': ')[2] or 'GVTORCH_WHOLE=0'}"
+    reason = f"{_STARVED}{os.environ['GVTORCH_WHOLE'].partition(': ')[2] or 'GVTORCH_WHOLE=0'}"
     for item in filter(runs_here, items):
         name = item.nodeid
         many = cases[name.partition("[")[0]] >= 6
@@ -312,10 +313,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     backends = [value for name, value in report.user_properties if name == "backend"]
-    if report.skipped and isinstance(report.longrepr, tuple) and ABSENT in report.longrepr[2]:
-        _absent.add(report.longrepr[2].partition(ABSENT)[2])
-    if report.skipped and isinstance(report.longrepr, tuple) and _STARVED in report.longrepr[2]:
-        _left_out[report.longrepr[2].partition(f"{_STARVED}: ")[2]] += 1
+    if report.skipped and isinstance(report.longrepr, tuple):
+        reason = report.longrepr[2]
+        if ABSENT in reason:
+            _absent.add(reason.partition(ABSENT)[2])
+        if _STARVED in reason:
+            _left_out[reason.partition(_STARVED)[2]] += 1
     if report.when == "call" and report.passed:
         _ran.update(backends)
 

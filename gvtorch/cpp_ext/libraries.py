@@ -74,7 +74,9 @@ def packet_commands(output: Path) -> dict[Path, list[str]]:
 
 
 def object_commands(output: Path) -> dict[Path, list[str]]:
-    """Returns the same of the CPU's other objects, which need torch's headers."""
+    """Returns the compiler calls of the CPU's other objects, by the object's path under `output`.
+    They need torch's headers.
+    """
     include, _ = compilers.torch_flags()
     flags = (["-DGV_X86"] if _is_x86() else []) + include
     return {
