@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import faulthandler
 import json
-import multiprocessing
 import random
 import resource
 import shutil
@@ -14,13 +13,11 @@ from typing import Any
 
 import gvtorch as gv
 from gvtorch.io.reading import open_source
+from helpers.processes import CONTEXT
 
 COPIES = 50
 _SECONDS = 240
 _MEMORY = 3 << 30  # bytes of address space beyond what the libraries use
-# Each call is a copy of a process that has imported these: it takes a twentieth of a start.
-_CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["torch", "gvtorch.io.reading"])
 
 
 def _read(paths: list[Path], options: dict[str, Any], log: Path) -> None:
@@ -77,7 +74,7 @@ def outcomes(path: Path, folder: Path, **options: Any) -> list[tuple[str, str]]:
             copy.write_bytes(break_file(path.read_bytes(), number))
         paths.append(copy)
     log = folder / "log"
-    process = _CONTEXT.Process(target=_read, args=(paths, options, log))
+    process = CONTEXT.Process(target=_read, args=(paths, options, log))
     process.start()
     process.join(_SECONDS)
     process.kill()

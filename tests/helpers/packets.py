@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,6 +15,7 @@ from torch import Tensor
 
 import gvtorch as gv
 from helpers import TESTS
+from helpers.processes import CONTEXT
 from helpers.rays import camera_rays
 from helpers.traces import trace
 from helpers.trees import with_holes
@@ -31,19 +31,19 @@ class Run(NamedTuple):
 def start(
     function: Callable[[], object], folder: Path, instructions: str, **environment: str
 ) -> Run:
-    """Calls a function of a test file in a new process, which saves what it returns. It is forked
-    from one that has imported torch, and imports gvtorch itself.
+    """Calls a function of a test file in a new process, which saves what it returns. Nothing has
+    been traced there before: the instruction set is chosen at the first call of a kernel.
     """
     module, name, file = function.__module__, function.__name__, folder / f"{instructions}.pt"
     variables = {**os.environ, "GVTORCH_CPU": instructions, **environment}
     code = (
         f"import os, sys, torch; os.environ.clear(); os.environ.update({variables!r})\n"
-        f"assert 'gvtorch' not in sys.modules; sys.path.insert(0, {str(TESTS)!r})\n"
-        f"from {module} import {name}; torch.save({name}(), {str(file)!r})"
+        "from gvtorch.cpp_ext import instructions\n"
+        f"assert instructions() in {INSTRUCTIONS[: INSTRUCTIONS.index(instructions) + 1]}\n"
+        f"sys.path.insert(0, {str(TESTS)!r}); from {module} import {name}\n"
+        f"torch.save({name}(), {str(file)!r})"
     )
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torch"])
-    process = context.Process(target=exec, args=(code, {}))
+    process = CONTEXT.Process(target=exec, args=(code, {}))
     process.start()
     return Run(process, file)
 
