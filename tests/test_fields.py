@@ -374,6 +374,7 @@ def test_what_is_unknown_is_no_error():
             gv.FieldProducer(Bounded(lambda x: None, box), 64)
 
 
+@pytest.mark.long
 def test_joined_bricks_compile_whole():
     parts = {"a": sdf.Sphere(0.7), "b": sdf.Box()}
     fields = {name: gv.Solid(shape, colors=False) for name, shape in parts.items()}

@@ -141,6 +141,7 @@ def test_colours_are_drawn_lit_in_one_line(store, tmp_path):
     assert bad.returncode == 2 and "--channel is not for" in bad.stderr
 
 
+@pytest.mark.long
 def test_a_broken_off_store_goes_on_and_is_the_same(tmp_path, mesh, monkeypatch):
     options = {"resolution": 150, "channels": NAMES, "workers": 1}
     whole = tmp_path / "whole" / "a.zarr"

@@ -174,6 +174,7 @@ def beat(tmp_path_factory) -> str:
     return str(folder / "beat.zarr")
 
 
+@pytest.mark.long
 def test_time_is_slid_and_played(chromium, beat):
     state = gv.ViewState(shader=BANDS, develop=Development(samples=1))
     with gv.view(beat, state=state, browser=False, wait=False) as viewer:
