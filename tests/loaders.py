@@ -24,7 +24,8 @@ class Pictures(torch.utils.data.Dataset):
 
     def __getitem__(self, index: int) -> torch.Tensor:
         producer = copy.deepcopy(self.producer) or gv.StoredProducer(self.path)
-        with gv.Engine(producer, brick_pool="1 MB", node_pool="1 MB") as engine:
+        pools = {"brick_pool": "1 MB", "node_pool": "1 MB"}
+        with gv.Engine(producer, **pools, device="cpu") as engine:
             view = gv.Camera.orbit(40 * index, width=8, height=8)
             return engine.render(view, gv.TransferFunction.preset("gray", 0, 255)).color
 

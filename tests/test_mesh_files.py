@@ -127,7 +127,7 @@ def test_polygons_that_are_not_convex_are_cut_within_themselves(tmp_path, count,
     (tmp_path / "a.obj").write_text("\r\n".join(lines) + "\r\n")
     mesh = gv.read_mesh(tmp_path / "a.obj")
     a, b, c = mesh.corners.transpose(1, 0, 2) @ tilt
-    area = 0.5 * np.cross((b - a)[:, :2], (c - a)[:, :2])
+    area = 0.5 * np.cross(b - a, c - a)[:, 2]
     after = np.roll(flat, -1, 0)
     whole = 0.5 * (flat[:, 0] * after[:, 1] - flat[:, 1] * after[:, 0]).sum()
     assert len(area) == count - 1 and (area[:-1] * np.sign(whole) > 0).all()

@@ -95,6 +95,27 @@ def test_workers_of_data_loaders(workers, method):
     assert "forked after one was opened" in str(workers["fork outside"]), workers
 
 
+@pytest.mark.backend("cuda")
+@pytest.mark.filterwarnings("ignore:.*fork")
+def test_a_forked_child_is_told_that_it_can_not_use_cuda(blobs):
+    gv.N3Tree.from_volume(blobs, device="cuda")
+    context = multiprocessing.get_context("fork")
+    receive, send = context.Pipe(duplex=False)
+
+    def child() -> None:
+        try:
+            gv.Engine(gv.VolumeProducer(blobs), device="cuda")
+        except BaseException as error:
+            send.send(repr(error))
+        os._exit(0)
+
+    process = context.Process(target=child)
+    process.start()
+    assert receive.poll(300)
+    assert "Engine: device 'cuda' can't be used here: this process was forked" in receive.recv()
+    process.join(60)
+
+
 @pytest.mark.filterwarnings("ignore:.*fork")
 def test_a_forked_child_has_threads_of_its_own(store):
     """The threads of before the fork are gone: an answer would never arrive."""

@@ -330,8 +330,8 @@ def test_a_foreign_image_is_streamed_as_well(tmp_path, cloud):
 @pytest.mark.long
 @pytest.mark.backend("cpp")
 def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
-    """A generated volume of 1 GiB, converted in less than 2 GB: pools of a sixteenth give the same
-    picture as pools that hold everything.
+    """A generated volume of 1 GiB, converted by two processes in less than 2 GB: pools of a
+    sixteenth give the same picture as pools that hold everything.
     """
     raw = np.lib.format.open_memmap(
         tmp_path / "big.npy", mode="w+", dtype=np.uint8, shape=(1024,) * 3
@@ -350,7 +350,7 @@ def test_a_store_of_1024_cubed_from_small_pools(tmp_path):
     del raw
     folder = tmp_path / "big.zarr"
     with MemorySampler() as memory:
-        convert(tmp_path / "big.npy", folder)
+        convert(tmp_path / "big.npy", folder, workers=2)
     assert 1e8 < memory.peak - memory.initial < 2e9, "all processes, without what was there before"
     (tmp_path / "big.npy").unlink()
     views = [camera(64, distance=d, azimuth=a) for d, a in ((1.3, 20), (0.3, 200))]

@@ -13,7 +13,8 @@ def in_branches(*jobs: Callable[[], Any]) -> list[Any]:
     branches, which run at the same time and are joined at the end; else they run one by one. No job
     may write what another reads.
     """
-    if not (torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()):
+    # What is not initialized captures nothing, and a forked child may not even ask.
+    if not (torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()):
         return [job() for job in jobs]
     main = torch.cuda.current_stream()
     streams = [main, *(torch.cuda.Stream() for _ in jobs[1:])]

@@ -26,6 +26,7 @@ from .constants import MAX_EXTENT
 from .messages import one_line
 
 Kind = TypeVar("Kind")
+_IMPORTED_BY = os.getpid()
 
 
 def describe(tensor: Any) -> str:
@@ -254,6 +255,13 @@ def device(context: str, value: Any) -> torch.device:
             ) from None
     if not torch.cuda.is_available():
         raise ValueError(f"{context}: device 'cuda' can't be used here: torch sees no CUDA device")
+    try:
+        torch.cuda.init()
+    except RuntimeError as error:
+        reason = one_line(str(error).partition("\n")[0])
+        if os.getpid() != _IMPORTED_BY:
+            reason = "this process was forked; start it by 'spawn' or 'forkserver'"
+        raise ValueError(f"{context}: device 'cuda' can't be used here: {reason}") from error
     index = torch.cuda.current_device() if parsed.index is None else parsed.index
     count = torch.cuda.device_count()
     if index >= count:
