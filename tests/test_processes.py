@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import multiprocessing
-import os
 import pickle
 from concurrent.futures import Future
 from pathlib import Path
@@ -16,6 +14,7 @@ import torch
 from helpers import meshes
 from helpers.packets import result, start
 from helpers.pictures import GRAY, assert_same_picture
+from helpers.processes import in_forked_child
 from helpers.stores import noise
 
 import gvtorch as gv
@@ -99,21 +98,8 @@ def test_workers_of_data_loaders(workers, method):
 @pytest.mark.filterwarnings("ignore:.*fork")
 def test_a_forked_child_is_told_that_it_can_not_use_cuda(blobs):
     gv.N3Tree.from_volume(blobs, device="cuda")
-    context = multiprocessing.get_context("fork")
-    receive, send = context.Pipe(duplex=False)
-
-    def child() -> None:
-        try:
-            gv.Engine(gv.VolumeProducer(blobs), device="cuda")
-        except BaseException as error:
-            send.send(repr(error))
-        os._exit(0)
-
-    process = context.Process(target=child)
-    process.start()
-    assert receive.poll(300)
-    assert "Engine: device 'cuda' can't be used here: this process was forked" in receive.recv()
-    process.join(60)
+    told = in_forked_child(lambda: gv.Engine(gv.VolumeProducer(blobs), device="cuda"))
+    assert "Engine: device 'cuda' can't be used here: this process was forked" in told
 
 
 @pytest.mark.filterwarnings("ignore:.*fork")
@@ -122,22 +108,13 @@ def test_a_forked_child_has_threads_of_its_own(store):
     producer = gv.StoredProducer(store)
     with gv.Engine(producer) as engine:
         engine.render(VIEW, GRAY)
-        context = multiprocessing.get_context("fork")
-        receive, send = context.Pipe(duplex=False)
 
-        def child() -> None:
+        def answer() -> object:
             (source,) = engine.trees.values()
             loc = torch.zeros((1, 4), dtype=torch.int64)
-            answer = producer.fill(gv.Nodes(loc, source.layout))
-            assert isinstance(answer, Future)
-            try:
-                send.send(str(answer.result(60).errors))
-            except BaseException as error:
-                send.send(repr(error))
-            os._exit(0)
+            filled = producer.fill(gv.Nodes(loc, source.layout))
+            assert isinstance(filled, Future)
+            return filled.result(60).errors
 
-        process = context.Process(target=child)
-        process.start()
-        assert receive.poll(300) and "forked after one was opened" in receive.recv()
-        process.join(60)
+        assert "forked after one was opened" in in_forked_child(answer)
         assert_same_picture(engine.render(VIEW, GRAY), engine.render(VIEW, GRAY))

@@ -13,7 +13,7 @@ def in_branches(*jobs: Callable[[], Any]) -> list[Any]:
     branches, which run at the same time and are joined at the end; else they run one by one. No job
     may write what another reads.
     """
-    # What is not initialized captures nothing, and a forked child may not even ask.
+    # Without CUDA in use there is no capture; in a forked child even the question is an error.
     if not (torch.cuda.is_initialized() and torch.cuda.is_current_stream_capturing()):
         return [job() for job in jobs]
     main = torch.cuda.current_stream()

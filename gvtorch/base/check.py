@@ -26,7 +26,7 @@ from .constants import MAX_EXTENT
 from .messages import one_line
 
 Kind = TypeVar("Kind")
-_IMPORTED_BY = os.getpid()
+_IMPORTED_BY = os.getpid()  # a process with another number was forked later
 
 
 def describe(tensor: Any) -> str:
@@ -237,7 +237,9 @@ def images(context: str, name: str, value: Any, channels: int, *, batch: bool = 
 
 
 def device(context: str, value: Any) -> torch.device:
-    """Returns a device as in `tensor.device`, CUDA always with an index; ValueError if absent."""
+    """Returns a device as in `tensor.device`, CUDA always with an index; ValueError if it
+    can't be used.
+    """
     try:
         parsed = torch.device(value)
     except (RuntimeError, TypeError):

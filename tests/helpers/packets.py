@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 import gvtorch as gv
+from gvtorch import cpp_ext
 from helpers import TESTS
 from helpers.processes import CONTEXT
 from helpers.rays import camera_rays
@@ -32,14 +33,17 @@ def start(
     function: Callable[[], object], folder: Path, instructions: str, **environment: str
 ) -> Run:
     """Calls a function of a test file in a new process, which saves what it returns. Nothing has
-    been traced there before: the instruction set is chosen at the first call of a kernel.
+    been traced there before: the instruction set is chosen at the first call of a kernel, and is
+    the one asked for, or the widest of this process if that is narrower.
     """
+    asked = INSTRUCTIONS.index(instructions)
+    least = min(asked, INSTRUCTIONS.index(cpp_ext.instructions()))
     module, name, file = function.__module__, function.__name__, folder / f"{instructions}.pt"
     variables = {**os.environ, "GVTORCH_CPU": instructions, **environment}
     code = (
         f"import os, sys, torch; os.environ.clear(); os.environ.update({variables!r})\n"
         "from gvtorch.cpp_ext import instructions\n"
-        f"assert instructions() in {INSTRUCTIONS[: INSTRUCTIONS.index(instructions) + 1]}\n"
+        f"assert instructions() in {INSTRUCTIONS[least : asked + 1]}\n"
         f"sys.path.insert(0, {str(TESTS)!r}); from {module} import {name}\n"
         f"torch.save({name}(), {str(file)!r})"
     )
