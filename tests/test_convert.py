@@ -8,6 +8,7 @@ import gzip
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -403,6 +404,18 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
     with pytest.raises(ValueError, match="half-written: 0 of 8"):
         Store.open(target)
     assert_holds(convert(raw, target, workers=1, resume=True), data)
+
+
+def test_a_store_that_is_removed_meanwhile_is_named(tmp_path, raw):
+    target, reports = tmp_path / "a.zarr", []
+
+    def remove(name: str, done: int, total: int) -> None:
+        reports.append(name)
+        if len(reports) == 2:
+            shutil.rmtree(target)
+
+    with pytest.raises(OSError, match=re.escape(f"{target}/")):
+        convert(raw, target, workers=1, progress=remove)
 
 
 KILLED = """

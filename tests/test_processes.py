@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import os
 import pickle
+import subprocess
+import sys
 from concurrent.futures import Future
 from pathlib import Path
 
@@ -100,6 +103,26 @@ def test_a_forked_child_is_told_that_it_can_not_use_cuda(blobs):
     gv.N3Tree.from_volume(blobs, device="cuda")
     told = in_forked_child(lambda: gv.Engine(gv.VolumeProducer(blobs), device="cuda"))
     assert "Engine: device 'cuda' can't be used here: this process was forked" in told
+
+
+@pytest.mark.backend("cuda")
+def test_an_import_leaves_cuda_to_forked_children():
+    """Workers of a data loader, say, may use CUDA if the process that forks them does not."""
+    code = """
+import gvtorch as gv, gvtorch.ops, torch
+from helpers.processes import in_forked_child
+volume = gv.Volume(torch.ones(8, 8, 8))
+gv.render(gv.N3Tree.from_volume(volume), gv.Camera.orbit(width=4, height=4))
+print(in_forked_child(lambda: gv.Engine(gv.VolumeProducer(volume), device="cuda").device))
+"""
+    ran = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        text=True,
+        capture_output=True,
+        check=False,
+    )
+    assert ran.stdout.strip() == "cuda:0", ran
 
 
 @pytest.mark.filterwarnings("ignore:.*fork")

@@ -35,7 +35,7 @@ def load() -> dict[str, str]:
         reasons["cuda"] = "it needs the C++ library"
     elif torch.version.cuda is None:
         reasons["cuda"] = f"this torch ({torch.__version__}) is built without CUDA"
-    elif not torch.cuda.is_available():
+    elif torch.cuda.device_count() == 0:  # `is_available` would keep forked children from CUDA
         reasons["cuda"] = "torch sees no CUDA device"
     else:
         reasons["cuda"] = _load("libgvtorch_cuda.so")

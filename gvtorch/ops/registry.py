@@ -31,12 +31,17 @@ _Fake = TypeVar("_Fake", bound=Callable[..., Any])
 #: Name of an op -> its fake. Those of the modules that are loaded; `gvtorch.ops` loads all.
 FAKES: dict[str, Callable[..., Any]] = {}
 _libraries: dict[str, torch.library.Library] = {}  # kernels last as long as these
-_reasons = cpp_ext.load()  # why a backend can't be used
+_reasons = cpp_ext.load()  # why a backend can't be used, as far as one knows without using CUDA
 
 
 def unavailable() -> dict[str, str]:
-    """Returns why each of reference, cpp, cuda can't be used here; an empty text if it can."""
-    return {"reference": "", **_reasons}
+    """Returns why each of reference, cpp, cuda can't be used here; an empty text if it can. Where
+    that asks CUDA's driver, processes that are forked later can't use CUDA.
+    """
+    reasons = {"reference": "", **_reasons}
+    if not reasons["cuda"] and not torch.cuda.is_available():
+        reasons["cuda"] = "torch can't use the CUDA device: its driver is too old, or fails"
+    return reasons
 
 
 def device_of(backend: str) -> torch.device:

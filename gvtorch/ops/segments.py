@@ -11,10 +11,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import cpp_ext
 from ..base import check
 from .arguments import RayArguments, Samples, Segments, TraceArguments
 from .reference import segments as twins
-from .registry import Backend, argument_names, choose_backend, fake_of, runs_twin, unavailable
+from .registry import Backend, argument_names, choose_backend, fake_of, runs_twin
 from .trace import check_channel, check_rays, check_real, check_trace, check_voxels
 
 _SEGMENT_BYTES = 84  # at most, in float64
@@ -326,7 +327,7 @@ def _composite_gradient(
     return alpha, feature, None, clear, None
 
 
-if not unavailable()["cpp"]:
+if not cpp_ext.load()["cpp"]:
     register = torch.library.register_autograd
     register("gvtorch::sample_bricks", _sample_gradient, setup_context=_save_samples)
     register("gvtorch::composite", _composite_gradient, setup_context=_save_composite)

@@ -25,9 +25,10 @@ from ...base.stage import Progress, no_progress
 from ...base.whole_file import name_in_errors
 from ..resources import amount
 from .ngff import read_json_file
-from .shard import begin_write, bordered, create_array, finish_write
+from .shard import begin_write, bordered, finish_write
 from .store import Store
 from .store_layout import BORDER, WORK, CoarseChannel, is_name
+from .tensorstores import open_array
 from .unfinished import group_metadata, locked, write_json
 
 _CUBE_SIDE = 128  # voxels along a side of the cubes that are written at once
@@ -139,7 +140,7 @@ def _write_blocks(
     done, total = 0, sum(math.prod(values.shape[:3]) for values in levels)
     for level, values in enumerate(levels, 1):
         spec = store.layout.coarse(level, f"{store.coarse_folder}/{folder}", width)
-        create_array(store.root, spec)
+        open_array(store.root, spec, "create")
         for low in itertools.product(*(range(0, n, _CUBE_SIDE) for n in values.shape[:3])):
             size = [min(_CUBE_SIDE, n - a) for a, n in zip(low, values.shape, strict=False)]
             padded_size = np.multiply(-(-np.array(size) // block), block)

@@ -36,10 +36,9 @@ from .conversion_plan import (
 )
 from .store import Store
 from .store_layout import JOURNAL, RESUME_ADVICE, WORK
-from .tensorstores import Deadline, begin_open
+from .tensorstores import LOCAL_TIMEOUT, Deadline, open_array
 
 _TASKS_AHEAD = 64  # tasks submitted at a time to an executor whose number of workers is unknown
-_OPEN_TIMEOUT = 60.0  # seconds
 
 
 def convert(
@@ -269,9 +268,9 @@ def _write_levels(
 
 def _value_range(task: shard.Conversion) -> list[list[float]]:
     """Returns [low, high] of each channel over all times, from the last level: a single cell."""
-    deadline = Deadline(_OPEN_TIMEOUT)
     spec = task.layout.cells(task.layout.levels - 1)
-    cells = deadline.wait(deadline.wait(begin_open(task.root, spec), "cells").read(), "cells")
+    future = open_array(task.root, spec).read()
+    cells = Deadline(LOCAL_TIMEOUT).wait(future, f"{task.root['path']}{spec['path']}")
     cells = cells.reshape(-1, 3, task.layout.width)
     lows, highs = cells[:, 0].min(0), cells[:, 1].max(0)
     return [[low.item(), high.item()] for low, high in zip(lows, highs, strict=True)]

@@ -22,11 +22,9 @@ from .checksums import shard_checksums
 from .chunk_files import files_of
 from .level_reader import Pool, StoredArray
 from .store_layout import BORDER, CELL, RESUME_ADVICE, StoreLayout
-from .tensorstores import Deadline, StoreError, begin_open, one_line_error
+from .tensorstores import LOCAL_TIMEOUT, Deadline, StoreError, one_line_error, open_array
 from .unfinished import TaskResult
 
-_TIMEOUT = 3600.0  # seconds for one read of local data
-_OPEN_TIMEOUT = 60.0  # seconds
 _SLAB_PLANES = 32  # planes of a level made at a time, from one chunk (64 planes) of the level below
 
 ShardIndex = tuple[int, ...]  # z, y, x, or t, z, y, x where a store has several time points
@@ -82,7 +80,7 @@ def write_shard(conversion: Conversion, level: int, index: ShardIndex) -> TaskRe
     for future in writes:
         finish_write(future, conversion.root.get("path", "store"))
     specs = (layout.pyramid(level), layout.cells(level), layout.blocks(level))
-    files = shard_checksums(conversion.root, specs, index, Deadline(_TIMEOUT))
+    files = shard_checksums(conversion.root, specs, index, Deadline(LOCAL_TIMEOUT))
     return TaskResult(index, int(np.prod(size)), files)
 
 
@@ -108,11 +106,11 @@ def _pool_finer_level(
     (labels: the most frequent), and smallest and largest finest values.
     """
     pools: tuple[Pool, ...] = (conversion.pool, pool_min, pool_max)
-    layout, deadline = conversion.layout, Deadline(_TIMEOUT)
+    layout, deadline = conversion.layout, Deadline(LOCAL_TIMEOUT)
     arrays = []
     # Level 0 has no bounds: there, values are both the smallest and the largest.
     for spec in (layout.pyramid(level - 1), *layout.bounds(level - 1)):
-        array = deadline.wait(begin_open(conversion.root, spec), spec["path"])
+        array = open_array(conversion.root, spec)
         files = files_of(spec["path"], array)
         array = layout.at_time(array, time)
         arrays.append(StoredArray(array, files, "czyx"[-array.rank :], (1, 1, 1), spec["path"]))
@@ -174,7 +172,7 @@ def begin_write(
     time: int | None = None,
 ) -> Any:
     """Starts writing a box into an array of the store, at `time` if given; returns a future."""
-    array = Deadline(_TIMEOUT).wait(begin_open(root, spec, "write"), spec["path"])
+    array = open_array(root, spec, "write")
     array = array if time is None else array[time]
     low = [0, *low] if data.ndim == 4 else low  # (c, z, y, x)
     low = [*low, *[0] * (data.ndim - len(low))]
@@ -196,15 +194,10 @@ def create_arrays(conversion: Conversion, level: int) -> None:
     layout = conversion.layout
     arrays = (layout.pyramid(level), layout.blocks(level), layout.cells(level))
     for spec in (*arrays, *layout.bounds(level)):
-        create_array(conversion.root, spec)
+        open_array(conversion.root, spec, "create")
 
 
 def write_label_array(conversion: Conversion, labels: np.ndarray) -> None:
     root, spec = conversion.root, conversion.layout.labels()
-    create_array(root, spec)
+    open_array(root, spec, "create")
     finish_write(begin_write(root, spec, [0], labels), root.get("path", "store"))
-
-
-def create_array(root: dict[str, Any], spec: dict[str, Any]) -> None:
-    """Creates an empty array unless it exists."""
-    Deadline(_OPEN_TIMEOUT).wait(begin_open(root, spec, "create"), f"{root['path']}{spec['path']}")

@@ -17,6 +17,7 @@ from ..resources import cores
 from .store_layout import WRITE_ZEROS
 
 MAX_JSON_BYTES = 1 << 24  # of metadata
+LOCAL_TIMEOUT = 3600.0  # seconds for one read of local data
 
 
 class StoreError(OSError):
@@ -157,6 +158,12 @@ def begin_open(root: Any, spec: dict[str, Any], mode: str = "read") -> Any:
     unused = omitted.get(mode, ("path",))
     array_spec = {key: value for key, value in spec.items() if key not in unused}
     return opened_at(child(root, spec["path"]), array_spec, create=mode == "create")
+
+
+def open_array(root: dict[str, Any], spec: dict[str, Any], mode: str = "read") -> Any:
+    """Opens an array of a store on this machine; see `begin_open`. Raises as `Deadline.wait`."""
+    array_path = f"{root['path']}{spec['path']}"
+    return Deadline(LOCAL_TIMEOUT).wait(begin_open(root, spec, mode), array_path)
 
 
 def opened_at(folder: Any, spec: dict[str, Any], *, create: bool = False) -> Any:
