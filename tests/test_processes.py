@@ -112,7 +112,8 @@ def test_an_import_leaves_cuda_to_forked_children():
 import gvtorch as gv, gvtorch.ops, torch
 from helpers.processes import in_forked_child
 volume = gv.Volume(torch.ones(8, 8, 8))
-gv.render(gv.N3Tree.from_volume(volume), gv.Camera.orbit(width=4, height=4))
+shader = gv.TransferFunction.preset("gray", 0, 1)
+gv.render(gv.N3Tree.from_volume(volume), gv.Camera.orbit(width=4, height=4), shader)
 print(in_forked_child(lambda: gv.Engine(gv.VolumeProducer(volume), device="cuda").device))
 """
     ran = subprocess.run(
