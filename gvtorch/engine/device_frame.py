@@ -16,7 +16,7 @@ from torch import Tensor
 from ..base.branches import in_branches
 from ..base.constants import ABSENT, REQUEST_LOAD, REQUEST_PRIORITY, REQUEST_SUBDIVIDE
 from ..cache.requests import levels_wanted, nodes_to_subdivide
-from ..cache.write import Targets, put_bricks, put_tiles, put_uniform, write_rows
+from ..cache.write import Children, Targets, put_bricks, put_tiles, put_uniform, write_rows
 from ..producers import Region
 from ..producers.answer import checked_bricks, checked_regions
 from .parents import nearest_loadable, parent_bricks, without_repeats
@@ -32,6 +32,14 @@ class UncheckedAnswer(NamedTuple):
     node: Tensor  # (batch,) int64 nodes that were asked for, -1 for none
     batch: RequestBatch
     answer: Any
+
+
+class MadeTiles(NamedTuple):
+    """Tiles that a producer's answer describes, not written yet."""
+
+    targets: Targets  # nodes (batch,) to subdivide, -1 for none
+    children: Children
+    failed: Tensor  # () int64 number of nodes with an invalid answer
 
 
 class DeviceFrame(RecordedFrame):
@@ -51,24 +59,21 @@ class DeviceFrame(RecordedFrame):
         return not steady
 
     def serve(self) -> None:
-        """Serves the requests of the last frame that rank first. Producers fill and classify at the
-        same time; their answers are written after that.
+        """Serves the requests of the last frame that rank first. Bricks are made and written while
+        tiles are made, which are written after that.
         """
         loads, subdivisions = self.choose()
-        bricks, regions = in_branches(
-            partial(self._ask_producers, REQUEST_LOAD, loads.node),
-            partial(self._ask_producers, REQUEST_SUBDIVIDE, subdivisions.node),
+        _, tiles = in_branches(
+            partial(self._load, loads.node), partial(self._make_tiles, subdivisions.node)
         )
-        for answer in bricks:
-            self._write_bricks(answer)
-        self._subdivide(regions, *subdivisions)
+        self._subdivide(tiles, *subdivisions)
 
     def deepen(self) -> None:
         """Subdivides nodes that `serve` or the previous `deepen` has just made, where the priority
         of the parent shows that rays will want finer ones, so that no ray has to ask for them.
         """
         chosen, priority = self._next_subdivisions.unbind(1)
-        self._subdivide(self._ask_producers(REQUEST_SUBDIVIDE, chosen), chosen, priority)
+        self._subdivide(self._make_tiles(chosen), chosen, priority)
 
     def _count_levels(self) -> Tensor:
         if self._production.by_level:
@@ -89,21 +94,31 @@ class DeviceFrame(RecordedFrame):
             answers.append(UncheckedAnswer(node, batch, batch.ask()))
         return answers
 
-    def _subdivide(
-        self, answers: Sequence[UncheckedAnswer], chosen: Tensor, priority: Tensor
-    ) -> None:
-        """Subdivides nodes (batch,), and lists the children to subdivide next, in order."""
+    def _subdivide(self, made: Sequence[MadeTiles], chosen: Tensor, priority: Tensor) -> None:
+        """Writes the tiles made for nodes (batch,), counts what was written and what failed, and
+        lists the children to subdivide next, in order.
+        """
         slot, child_priority = torch.full_like(chosen, -1), torch.zeros_like(chosen)
-        for answer in answers:
-            in_tree, branching = answer.node >= 0, answer.batch.source.layout.branching
-            slot = torch.where(in_tree, self._write_tiles(answer), slot)
-            child_priority = torch.where(in_tree, priority // branching, child_priority)
+        for targets, children, failed in made:
+            outcome = put_tiles(self.cache, targets, children, self._tiles.unused)
+            self._tiles.add(outcome)
+            self._failed_nodes.add_(failed)
+            in_tree = targets.node >= 0
+            slot = torch.where(in_tree, outcome.slot, slot)
+            child_priority = torch.where(
+                in_tree, priority // targets.tree.branching, child_priority
+            )
         node, split = nodes_to_subdivide(self.cache, slot, child_priority, self._tiles.unused)
         rank = split.flatten().cumsum(0)
         rows = torch.stack((node, child_priority[:, None].expand_as(node)), 2).flatten(0, 1)
         self._next_subdivisions.fill_(-1)
         listed = split.flatten() & (rank <= self.batch)
         write_rows(self._next_subdivisions, torch.where(listed, rank - 1, -1), rows)
+
+    def _load(self, chosen: Tensor) -> None:
+        """Gives nodes (batch,) their bricks."""
+        for answer in self._ask_producers(REQUEST_LOAD, chosen):
+            self._write_bricks(answer)
 
     def _write_bricks(self, unchecked: UncheckedAnswer) -> None:
         """Checks bricks, writes them, and counts what was written and what failed."""
@@ -122,22 +137,21 @@ class DeviceFrame(RecordedFrame):
         self._bricks.add(put_bricks(self.cache, targets, bricks.data, self._bricks.unused))
         self._failed_nodes.add_(((node >= 0) & ~valid).sum())
 
-    def _write_tiles(self, unchecked: UncheckedAnswer) -> Tensor:
-        """Checks regions, writes tiles, and counts what was written and what failed; returns the
-        tiles (k,), -1 for none.
-        """
-        node, batch, answer = unchecked
-        regions = checked_regions(answer, batch.nodes, batch.source.producer, check_values=False)
-        count = len(regions.kind)
-        valid = _finite([regions.constants, regions.ranges], count, node.device)
-        valid = valid & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)
-        valid = valid.view(len(node), -1).all(1)
-        children = children_of(batch, regions, self.cache)
-        targets = _masked_targets(batch.targets, node, valid)
-        outcome = put_tiles(self.cache, targets, children, self._tiles.unused)
-        self._tiles.add(outcome)
-        self._failed_nodes.add_(((node >= 0) & ~valid).sum())
-        return outcome.slot
+    def _make_tiles(self, chosen: Tensor) -> list[MadeTiles]:
+        """Asks producers for the regions of the children of nodes (batch,), and checks these."""
+        made = []
+        for node, batch, answer in self._ask_producers(REQUEST_SUBDIVIDE, chosen):
+            regions = checked_regions(
+                answer, batch.nodes, batch.source.producer, check_values=False
+            )
+            count = len(regions.kind)
+            valid = _finite([regions.constants, regions.ranges], count, node.device)
+            valid = valid & (regions.kind >= Region.EMPTY) & (regions.kind <= Region.DATA_MAX_DEPTH)
+            valid = valid.view(len(node), -1).all(1)
+            children = children_of(batch, regions, self.cache)
+            failed = ((node >= 0) & ~valid).sum()
+            made.append(MadeTiles(_masked_targets(batch.targets, node, valid), children, failed))
+        return made
 
     def _padded_batch(self, source: ProducedTree, kind: int, node: Tensor) -> RequestBatch:
         """Returns the request batch of nodes (k,), with the root where the index is -1."""
