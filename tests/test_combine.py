@@ -271,6 +271,33 @@ def test_a_network_becomes_a_producer():
     assert torch.equal(producer.at(points)["value"], network(points))
 
 
+class Watching(torch.nn.Module):
+    """A network that notes whether gradients by its weights are recorded."""
+
+    def __init__(self):
+        super().__init__()
+        self.network, self.recorded = torch.nn.Linear(3, 1), set()
+
+    def forward(self, points):
+        values = self.network(points)
+        self.recorded.add(values.requires_grad)
+        return values
+
+
+def test_an_engine_records_no_gradients_of_a_producer():
+    """They would take several times the memory of its bricks; what trains it calls `at`."""
+    producer = gv.FieldProducer(field := Watching(), 32, box=BOX, samples=1)
+    shader = gv.TransferFunction.preset("gray", 0, 1)
+    with gv.Engine(producer) as engine:
+        engine.frame(camera := gv.Camera.orbit(width=8, height=8), shader)
+        engine.render(camera, shader)
+        producer.changed()
+        engine.frame(camera, shader)
+    assert field.recorded == {False}
+    producer.at(random_points(5).float())["value"].sum().backward()
+    assert field.network.weight.grad is not None
+
+
 @pytest.mark.backend("cpp")
 def test_producers_of_any_kind_tell_values_at_points(blobs):
     """Trilinear between voxels, equal to a dense interpolation by torch."""

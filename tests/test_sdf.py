@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -144,6 +147,54 @@ def test_gradients_are_those_of_differences(named):
     )
     error = (shape.gradient(points) - by_steps).abs().amax(1)
     assert error.quantile(0.99) < 1e-6, "but where two surfaces meet"
+
+
+class Constant(sdf.Sphere):
+    def forward(self, points):
+        return torch.ones_like(points[..., 0])
+
+
+def test_gradients_are_the_same_where_nothing_is_recorded():
+    points = random_points(300)
+    for make in [*(make for make, _ in ALL.values()), Constant]:
+        shape = make()
+        expected = shape.surface_and_gradient(points.clone())
+        with torch.no_grad():
+            parts = shape.surface_and_gradient(points)
+        with torch.inference_mode():
+            inferred = shape.surface_and_gradient(points.clone())
+        assert all(map(torch.equal, parts, expected)), type(shape)
+        assert all(map(torch.equal, inferred, expected)), type(shape)
+        assert not any(part.requires_grad for part in parts)
+
+
+def test_gradients_of_normals_are_those_of_differences():
+    """Where something is recorded: by a parameter in backward mode, by points in forward mode."""
+    points, shape = random_points(50), sdf.Sphere()
+    shape.scale = torch.nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+    shape.forward = lambda at: (at * at).sum(-1) * shape.scale
+    shape.gradient(points).sum().backward()
+    assert torch.allclose(shape.scale.grad, 2 * points.sum())
+    with torch.no_grad():
+        _, change = torch.func.jvp(shape.gradient, (points,), (torch.ones_like(points),))
+        with torch.autograd.forward_ad.dual_level():
+            dual = torch.autograd.forward_ad.make_dual(points, torch.ones_like(points))
+            tangent = torch.autograd.forward_ad.unpack_dual(shape.gradient(dual)).tangent
+    assert torch.allclose(change, torch.full_like(points, 4.0))
+    assert tangent is not None and torch.allclose(tangent, change)
+
+
+def test_shapes_do_not_load_a_compiler():
+    """`torch.func` would, at its first use, which takes seconds."""
+    code = """
+import sys, torch, gvtorch as gv
+shape = gv.sdf.Box() | gv.sdf.Gyroid()
+with gv.Engine(gv.FieldProducer(shape, 16, box=((-1,) * 3, (1,) * 3))) as engine:
+    engine.render(gv.Camera.orbit(width=4, height=4), gv.TransferFunction.preset("gray", 0, 1))
+print("torch._dynamo" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_the_distance_to_a_box_is_that_to_its_nearest_face_edge_or_corner():

@@ -45,6 +45,14 @@ class ProducedTree:
         """Seconds after which an answer that has not come is given up."""
         return self.producer.patience_in(self.engine_patience)
 
+    def ask(self, kind: int, nodes: Nodes) -> Any:
+        """Calls the producer, which records no gradients: bricks carry none, and what a backward
+        pass would need is a multiple of their size.
+        """
+        producer_call = self.producer.fill if kind == REQUEST_LOAD else self.producer.classify
+        with torch.no_grad():
+            return producer_call(nodes)
+
     def wait(self, answer: Any) -> Any:
         """Returns the producer's answer; waits for a future, at most for `patience`."""
         if not isinstance(answer, Future):
@@ -137,9 +145,7 @@ class RequestBatch:
         return self.source.tree.number if name is None else [*layout.scene].index(name)
 
     def ask(self) -> Any:
-        producer = self.source.producer
-        producer_call = producer.fill if self.kind == REQUEST_LOAD else producer.classify
-        return producer_call(self.nodes)
+        return self.source.ask(self.kind, self.nodes)
 
     def check(self, answer: Any) -> Regions | Bricks:
         """Checks an answer; see producers/answer.py."""

@@ -9,7 +9,7 @@ from typing import Literal, TypedDict
 import torch
 
 from ..base import check
-from ..base.constants import ABSENT, CONSTANT, EMPTY, TERMINAL
+from ..base.constants import ABSENT, CONSTANT, EMPTY, REQUEST_LOAD, REQUEST_SUBDIVIDE, TERMINAL
 from ..base.messages import reason
 from ..base.volume import movable
 from ..cache import Cache
@@ -266,14 +266,14 @@ def _fill_root(cache: Cache, source: ProducedTree) -> None:
     tile = index // nodes.nodes_per_tile
     loc = torch.zeros((1, 4), dtype=torch.int64, device=nodes.child_tn.device)
     root = Nodes(loc, source.layout, coarse=bool(cache.finest[tile] > 0))
-    regions = checked_regions(source.wait(producer.classify(root)), root, producer)
+    regions = checked_regions(source.wait(source.ask(REQUEST_SUBDIVIDE, root)), root, producer)
     raise_first(regions.errors)
     for channel, stored in nodes.ranges.items():
         unknown = cache.bricks.channels[channel].unknown_range(1, device=stored.device)
         movable(stored)[tile, 0] = movable(regions.ranges.get(channel, unknown))[0]
     kind, constants = Region(int(regions.kind[0])), regions.constants
     if kind in (Region.DATA, Region.DATA_MAX_DEPTH):
-        bricks = checked_bricks(source.wait(producer.fill(root)), root, producer)
+        bricks = checked_bricks(source.wait(source.ask(REQUEST_LOAD, root)), root, producer)
         raise_first(bricks.errors)
         brick_kind = kind if bricks.kind is None else Region(int(bricks.kind[0]))
         if brick_kind not in (Region.DATA, Region.DATA_MAX_DEPTH):

@@ -17,8 +17,10 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ..base import check
+from ..base.lasting import in_transform
 from .field import Field, Interval, between, length
 
 Color = Sequence[float]  # linear red, green, blue, 0 to 1
@@ -61,9 +63,17 @@ class Distance(Field):
 
     def surface_and_gradient(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Returns distances (...,), linear colours (..., 3) and gradients (..., 3) at points."""
-        value, vjp, color = torch.func.vjp(self.surface, points, has_aux=True)  # type: ignore[misc]
-        (gradient,) = vjp(torch.ones_like(value))
-        return value, color, gradient
+        if not _computes_only():
+            value, vjp, color = torch.func.vjp(self.surface, points, has_aux=True)  # type: ignore[misc]
+            (gradient,) = vjp(torch.ones_like(value))
+            return value, color, gradient
+        with torch.enable_grad():  # the first vjp would import a compiler, which takes seconds
+            at = points.detach().requires_grad_()
+            value, color = self.surface(at)
+            gradient, ones = torch.zeros_like(points), torch.ones_like(value)
+            if value.requires_grad:
+                (gradient,) = torch.autograd.grad(value, at, ones, materialize_grads=True)
+        return value.detach(), color.detach(), gradient
 
     def slope(self, center: Tensor, half: Tensor) -> Tensor:
         """Returns (k,) float64: the most that the value changes per unit of length anywhere in
@@ -99,6 +109,13 @@ class Distance(Field):
 
     def __sub__(self, other: Distance) -> Difference:
         return Difference(self, other)
+
+
+def _computes_only() -> bool:
+    """Returns whether torch records nothing: no gradients in either mode, transform, or graph."""
+    recording = torch.is_grad_enabled() or forward_ad._current_level >= 0
+    compiling = torch.compiler.is_compiling() or torch.jit.is_tracing()
+    return not (recording or compiling or torch.is_inference_mode_enabled() or in_transform())
 
 
 class Pair(Distance):
