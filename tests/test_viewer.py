@@ -475,6 +475,40 @@ def test_a_draft_that_takes_long_gives_way_to_a_newer_view(session, monkeypatch)
         page.until(lambda: ended)  # a frame that goes on to its end does not add to it
 
 
+class Haze(torch.nn.Module):
+    """A shader with a parameter; notes whether gradients by it are recorded."""
+
+    def __init__(self):
+        super().__init__()
+        self.gain, self.recorded = torch.nn.Parameter(torch.tensor(0.01)), set()
+
+    def forward(self, values, positions, directions, lengths):
+        alpha = (self.gain * values).clamp(0, 1)
+        self.recorded.add(alpha.requires_grad)
+        return alpha.expand(-1, 3), alpha
+
+
+def test_pages_and_tiles_record_no_gradients_of_a_module_shader(tmp_path):
+    """Sixteen samples a pixel would hold those of sixteen pictures."""
+    session = new_session(bright_ball(), gv.ModuleShader(haze := Haze()))
+    try:
+        Page(session, 24, 16).final()
+    finally:
+        session.close()
+    assert haze.recorded == {False}
+    tree, camera = gv.N3Tree.from_volume(bright_ball()), gv.Camera.orbit(width=8, height=8)
+    seen: list[gv.Picture] = []
+
+    def draw(part: gv.Camera) -> gv.Picture:
+        seen.append(gv.render(tree, part, gv.ModuleShader(haze)))
+        return seen[-1]
+
+    gv.render_tiles(draw, camera, tmp_path / "a.npy")
+    assert not any(picture.color.requires_grad for picture in seen)
+    draw(camera)
+    assert seen[-1].color.requires_grad and haze.recorded == {False, True}
+
+
 def test_whole_states_with_what_json_can_not_tell_are_taken():
     module = gv.ModuleShader(gv.TransferModule(FUNCTION, 1.0))
     session = new_session(bright_ball(), module)

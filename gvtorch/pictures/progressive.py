@@ -194,7 +194,7 @@ def render_tiles(
             yield picture if overlay is None else overlay.over(picture, top)
             progress("rows", end, height)
 
-    with whole_file(path) as part:
+    with torch.no_grad(), whole_file(path) as part:
         _write_strips(part, path.suffix, pictures(), bits, (height, width), rows)
     assert stats is not None
     return stats

@@ -13,6 +13,8 @@ from concurrent.futures import Future, wait
 from dataclasses import replace
 from typing import Any
 
+import torch
+
 from ..base.messages import one_line
 from ..base.units import unit_symbol
 from ..base.volume import Volume
@@ -157,6 +159,7 @@ class Session:
 
     # The thread that renders.
 
+    @torch.no_grad()  # pictures of module shaders would hold all their samples
     def _run(self) -> None:
         while self._step():
             pass
