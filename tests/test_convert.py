@@ -465,6 +465,17 @@ def test_an_executor_of_ones_own(tmp_path, data, raw):
         assert_holds(convert(raw, tmp_path / "a.zarr", executor=pool), data)
 
 
+def test_processes_write_the_chosen_time_of_an_array(tmp_path):
+    series = np.arange(3 * 8**3, dtype=np.uint16).reshape(3, 8, 8, 8)
+    placement = {"spacing": (1, 2, 3), "origin": (4, 5, 6)}
+    source = open_source(series, axes="tzyx", time=2, **placement)
+    staged = source.staged(tmp_path)  # what worker processes read
+    for name in ("time", "times", "extent", "spacing", "origin", "info", "stored", "dropped"):
+        assert getattr(staged, name) == getattr(source, name)
+    everything = (0, 0, 0), (8, 8, 8)
+    assert np.array_equal(staged.read_region(*everything)[..., 0], series[2])
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_a_dask_cluster(tmp_path, data, raw):
     distributed = pytest.importorskip("distributed")
