@@ -460,6 +460,13 @@ def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
+def test_threads_write_what_can_not_be_sent_to_processes(tmp_path, data, monkeypatch):
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 0)
+    with pytest.importorskip("h5py").File(tmp_path / "a.h5", "w") as content:
+        content["data"] = data
+        assert_holds(convert(content["data"], tmp_path / "a.zarr", axes="zyxc", workers=2), data)
+
+
 def test_an_executor_of_ones_own(tmp_path, data, raw):
     with ThreadPoolExecutor(3) as pool:
         assert_holds(convert(raw, tmp_path / "a.zarr", executor=pool), data)
