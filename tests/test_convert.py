@@ -473,9 +473,27 @@ def test_processes_write_the_same(tmp_path, data, raw, monkeypatch):
     assert [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
+def test_threads_write_what_can_not_be_sent_to_processes(tmp_path, data, monkeypatch):
+    monkeypatch.setattr(conversion_plan, "_FEW_TASKS", 0)
+    with pytest.importorskip("h5py").File(tmp_path / "a.h5", "w") as content:
+        content["data"] = data
+        assert_holds(convert(content["data"], tmp_path / "a.zarr", axes="zyxc", workers=2), data)
+
+
 def test_an_executor_of_ones_own(tmp_path, data, raw):
     with ThreadPoolExecutor(3) as pool:
         assert_holds(convert(raw, tmp_path / "a.zarr", executor=pool), data)
+
+
+def test_processes_write_the_chosen_time_of_an_array(tmp_path):
+    series = np.arange(3 * 8**3, dtype=np.uint16).reshape(3, 8, 8, 8)
+    placement = {"spacing": (1, 2, 3), "origin": (4, 5, 6)}
+    source = open_source(series, axes="tzyx", time=2, **placement)
+    staged = source.staged(tmp_path)  # what worker processes read
+    for name in ("time", "times", "extent", "spacing", "origin", "info", "stored", "dropped"):
+        assert getattr(staged, name) == getattr(source, name)
+    everything = (0, 0, 0), (8, 8, 8)
+    assert np.array_equal(staged.read_region(*everything)[..., 0], series[2])
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -225,16 +225,9 @@ class MemorySource(VolumeSource):
         file = folder / "source.npy"
         with name_in_errors(file):
             save_npy(file, self.data)
-        return ArraySource(
-            path=str(file),
-            file=str(file),
-            shape=self.shape,
-            axes=self.axes,
-            stored=self.stored,
-            offset=file.stat().st_size - self.data.nbytes,  # behind the header
-            fortran=self.data.flags.fnc,
-            info=self.info,
-        )
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(VolumeSource)}
+        fields |= {"path": str(file), "file": str(file), "fortran": self.data.flags.fnc}
+        return ArraySource(offset=file.stat().st_size - self.data.nbytes, **fields)
 
     def read_stored(self, index: Index) -> np.ndarray:
         return self.data[index]

@@ -182,6 +182,7 @@ class Server:
         app.router.add_get("/", self._serve_page)
         app.router.add_get("/ws", self._serve_socket)
         app.router.add_get("/{name}", self._serve_page)
+        app.on_response_prepare.append(self._add_headers)
         app.on_shutdown.append(self._close_sockets)
         return app
 
@@ -201,20 +202,17 @@ class Server:
         return self._host not in _LOCAL_HOSTS  # an address can't be rebound
 
     async def _guard_request(self, request: Any, handler: Any) -> Any:
-        """Refuses foreign hosts, and adds the headers that isolate the page from other sites."""
-        web = self._web
+        """Refuses foreign hosts."""
         try:
             if not self.is_allowed(request.headers.get("Host")):
-                raise web.HTTPForbidden(text="This name is not the viewer's.")
-            response = await handler(request)
+                raise self._web.HTTPForbidden(text="This name is not the viewer's.")
+            return await handler(request)
         except ValueError:
-            raise web.HTTPBadRequest(text="No such address.", headers=_HEADERS) from None
-        except web.HTTPException as error:
-            error.headers.update(_HEADERS)
-            raise
-        if not response.prepared:
-            response.headers.update(_HEADERS)
-        return response
+            raise self._web.HTTPBadRequest(text="No such address.") from None
+
+    async def _add_headers(self, _request: Any, response: Any) -> None:
+        """Adds the headers that isolate the page from other sites, to errors as well."""
+        response.headers.update(_HEADERS)
 
     async def _serve_page(self, request: Any) -> Any:
         name = request.match_info.get("name", "index.html")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+import pickle
 import shutil
 import zlib
 from collections.abc import Sequence
@@ -199,7 +200,7 @@ def plan_of(
         settings=settings,
         labels=label_values,
         workers=min(workers, tasks[0]),
-        uses_processes=tasks[0] > _FEW_TASKS,
+        uses_processes=tasks[0] > _FEW_TASKS and _can_be_sent(source),
         source_files=_source_files(source, target),
     )
 
@@ -321,6 +322,15 @@ def _fingerprint(user_source: Any, source: VolumeSource, target: Path) -> list[A
             fields += unfinished.fingerprint(file)
     # What is read of it: the chosen array, its axes, byte order, ...
     return [*fields, zlib.crc32(repr(source).replace(source.path, "").encode())]
+
+
+def _can_be_sent(source: VolumeSource) -> bool:
+    """Returns whether other processes can be given a source: h5py's data sets can't be pickled."""
+    inner = _innermost(source)
+    try:
+        return not isinstance(inner, ObjectSource) or bool(pickle.dumps(inner))
+    except Exception:  # of any type, as the array's library raises it
+        return False
 
 
 def _innermost(source: VolumeSource) -> VolumeSource:
