@@ -238,7 +238,7 @@ def _task_bytes(plan: Plan) -> tuple[int, int]:
     layout, source = plan.task.layout, plan.task.source
     copies = _COPIES * (layout.shard + 2) ** 3 * layout.voxel_bytes
     cube_fraction = min(1.0, math.prod(layout.extent) / layout.shard**3)
-    source = source.inner if isinstance(source, IndexSource) else source
+    source = _innermost(source)
     source_bytes = source.data.nbytes if isinstance(source, MemorySource) else 0
     fixed_bytes = (_PROCESS_BYTES if plan.uses_processes else 0) + 2 * source.unpacked_bytes
     return fixed_bytes + int(copies * cube_fraction), source_bytes
