@@ -132,6 +132,9 @@ def test_memory_maps_are_mapped_again(tmp_path, grid):
     assert np.array_equal(source.read_region((1, 2, 3), (4, 5, 6))[..., 0], grid[1:4, 2:5, 3:6])
     view = mapped[2:]
     assert np.array_equal(gv.read_volume(view).data[..., 0].numpy(), grid[2:])
+    changed = np.load(tmp_path / "a.npy", mmap_mode="c")  # changes do not reach the file
+    changed[:] = 7
+    assert (gv.read_volume(changed).data == 7).all()
 
 
 def test_dates_of_xarray_are_times(grid):

@@ -260,9 +260,9 @@ def as_source(context: str, data: Any, axes: str | None = None) -> VolumeSource:
 
 def _memory_map(array: Any) -> dict[str, Any] | None:
     """Returns file, offset and order of an array that is a whole memory map, which other processes
-    can map too; None for others.
+    can map too; None for others, among them a copy-on-write map, whose changes the file lacks.
     """
-    if not isinstance(array, np.memmap) or array.filename is None:
+    if not isinstance(array, np.memmap) or array.filename is None or array.mode == "c":
         return None
     is_whole_map = array.base is not None and not isinstance(array.base, np.ndarray)
     if not is_whole_map or not (array.flags.c_contiguous or array.flags.f_contiguous):
