@@ -61,7 +61,8 @@ class FieldProducer(OwnDtypes, Producer):
         """Sets the field and the grid of voxels.
 
         Args:
-            field: A field or module; a `Distance` is converted to the `Solid` that it bounds.
+            field: A field or module; a `Distance` is converted to the `Solid` that it bounds. Call
+                `changed` after its parameters have changed.
             extent: Voxels of the finest level, (x, y, z), or along the longest side of the box.
             box: World corners ((x, y, z), (x, y, z)); left out: the field's and 2 voxels around it.
             channels: What voxels hold; left out: the field's dtypes, by default float32. In integer
