@@ -137,6 +137,22 @@ def test_memory_maps_are_mapped_again(tmp_path, grid):
     assert (gv.read_volume(changed).data == 7).all()
 
 
+@pytest.mark.parametrize("make", [np.asarray, torch.as_tensor, Own, np.asfortranarray])
+def test_wide_labels_of_arrays_are_kept_at_any_time(tmp_path, make):
+    series = (1 << 40) + np.arange(3 * 4 * 5 * 6).reshape(3, 4, 5, 6) % 7
+    given = make(series)
+    with pytest.raises(ValueError, match=r"array: int64 values reach 1099511627782.*labels=True"):
+        gv.read_volume(given, axes="tzyx", time=0)
+    store = convert(given, tmp_path / "a.zarr", axes="tzyx", labels=True, workers=1)
+    assert store.times == 3
+    for time in (0, 2):
+        read = gv.read_volume(given, axes="tzyx", time=time, labels=True)
+        stored = gv.read_volume(tmp_path / "a.zarr", time=time)
+        for volume in (read, stored):
+            values = volume.label_values[volume.data[..., 0].long()]
+            assert np.array_equal(values.numpy(), series[time])
+
+
 def test_dates_of_xarray_are_times(grid):
     dates = np.datetime64("2026-11-30") + np.timedelta64(90, "m") * np.arange(3)
     axes = ("time", "z", "y", "x")

@@ -72,7 +72,9 @@ class ArrayLike:
         if hasattr(array, "data_vars"):
             variables = ", ".join(map(str, array.data_vars))
             raise ValueError(f"{context}: is a set of arrays, take one of them: {variables}")
-        if not hasattr(array, "shape") or not hasattr(array, "dtype"):
+        if isinstance(array, Tensor):
+            array = to_numpy(plain_tensor(context, array))
+        elif not hasattr(array, "shape") or not hasattr(array, "dtype"):
             array = _as_numpy(context, array)
         if isinstance(array, np.ma.MaskedArray):
             array = _fill_masked(context, array)
@@ -154,9 +156,8 @@ def as_volume(
             check.integer(context, "time", first_time, low=0, high=0)
             spacing = (1, 1, 1) if spacing is None else spacing
             return Volume(given, spacing, (0, 0, 0) if origin is None else origin, nan=nan)
-        array = ArrayLike.of(context, to_numpy(plain_tensor(context, given)), axis_letters)
-    else:
-        array = ArrayLike.of(context, given, axes)
+        axes = axis_letters
+    array = ArrayLike.of(context, given, axes)
     times = array.shape[array.axes.index("t")] if "t" in array.axes else 1
     check_extent(context, [n for n, a in zip(array.shape, array.axes, strict=True) if a != "t"])
     if time is None and times > 1:

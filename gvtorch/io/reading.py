@@ -16,7 +16,7 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from ..base import check
-from ..base.arrays import ArrayLike, as_volume
+from ..base.arrays import ArrayLike
 from ..base.boxes import check_extent
 from ..base.constants import MAX_VOXELS
 from ..base.volume import Volume, to_numpy
@@ -241,21 +241,17 @@ def as_source(context: str, data: Any, axes: str | None = None) -> VolumeSource:
         values, labels = to_numpy(data.data), data.label_values
         values = values if labels is None else labels.numpy()[values.astype(np.int64)]
         return MemorySource.of(values, path=data.name, info=data.info, **placement)
-    if not hasattr(data, "shape") or not hasattr(data, "dtype") or hasattr(data, "device"):
-        if not isinstance(data, np.ndarray):
-            return as_source(context, as_volume(data, axes=axes, context=context))
     array = ArrayLike.of(context, data, axes)
-    described = {name: getattr(array, name) for name in ("spacing", "origin", "info", "dropped")}
-    described["path"] = array.name or "array"
-    fields = {name: getattr(array, name) for name in ("shape", "axes", "flips")}
-    fields |= {"stored": array.dtype, **described}
+    names = ("shape", "axes", "flips", "spacing", "origin", "info", "dropped")
+    fields = {name: getattr(array, name) for name in names}
+    fields |= {"stored": array.dtype, "path": array.name or "array"}
     mapped = _memory_map(data)
     if mapped is not None:
         return ArraySource(**fields, **mapped)
-    source = ObjectSource(array=array, **fields)
     if array.lazy:
-        return source
-    return MemorySource.of(source.read_times(0, source.times), **described)
+        return ObjectSource(array=array, **fields)
+    values = array.read(tuple(slice(0, size) for size in array.shape))
+    return MemorySource(data=np.ascontiguousarray(values), **fields)
 
 
 def _memory_map(array: Any) -> dict[str, Any] | None:

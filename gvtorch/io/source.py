@@ -213,7 +213,7 @@ class ArraySource(VolumeSource):
 class MemorySource(VolumeSource):
     """A volume that lies in memory."""
 
-    data: np.ndarray = dataclasses.field(repr=False)  # (z, y, x, c) or (t, z, y, x, c)
+    data: np.ndarray = dataclasses.field(repr=False)
 
     @classmethod
     def of(cls, data: np.ndarray, **fields: Any) -> MemorySource:
