@@ -163,7 +163,7 @@ def test_bad_tables_are_named():
 class Numbered(gv.Producer):
     """Bricks in which every voxel identifies its node, in two channels."""
 
-    where, patience = "host", 0.5
+    where = "host"
 
     def __init__(self, side: int = 50):
         self.bricks = side**3
@@ -334,7 +334,6 @@ def test_what_finds_no_room_is_held_until_a_later_frame(device, where):
 def test_a_producer_that_never_answers_stalls_no_frame(device):
     producer = Numbered()
     producer.where = "never"
-    producer.patience = 60
     with gv.Engine(producer, device=device, brick_pool="50 MB") as engine:
         for _ in range(12):
             _, stats = engine.frame(camera(24), GRAY)

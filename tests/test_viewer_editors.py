@@ -202,7 +202,7 @@ def test_what_has_no_voxels_has_no_slices(session):
         page.final()
         page.send("change", state={"slices": {}})
         assert "no voxels of its own" in page.next("refused", 0)["text"]
-        assert page.of_type("state")[-1]["state"]["slices"] is None
+        assert page.next("state", 0)["state"]["slices"] is None
     finally:
         session_.close()
     page = Page(session)
