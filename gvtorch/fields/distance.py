@@ -67,8 +67,10 @@ class Distance(Field):
             value, vjp, color = torch.func.vjp(self.surface, points, has_aux=True)  # type: ignore[misc]
             (gradient,) = vjp(torch.ones_like(value))
             return value, color, gradient
-        with torch.enable_grad():  # the first vjp would import a compiler, which takes seconds
-            at = points.detach().requires_grad_()
+        # The first vjp would import a compiler, which takes seconds; in inference mode it may be 0.
+        with torch.inference_mode(False), torch.enable_grad():
+            at = points.clone() if points.is_inference() else points.detach()
+            at.requires_grad_()
             value, color = self.surface(at)
             gradient, ones = torch.zeros_like(points), torch.ones_like(value)
             if value.requires_grad:
@@ -115,7 +117,7 @@ def _computes_only() -> bool:
     """Returns whether torch records nothing: no gradients in either mode, transform, or graph."""
     recording = torch.is_grad_enabled() or forward_ad._current_level >= 0
     compiling = torch.compiler.is_compiling() or torch.jit.is_tracing()
-    return not (recording or compiling or torch.is_inference_mode_enabled() or in_transform())
+    return not (recording or compiling or in_transform())
 
 
 class Pair(Distance):
