@@ -405,16 +405,16 @@ def test_a_full_disk_is_told_and_goes_on(tmp_path, raw, data, monkeypatch):
     assert_holds(convert(raw, target, workers=1, resume=True), data)
 
 
-def test_a_store_that_is_removed_meanwhile_is_named(tmp_path, raw):
+def test_a_store_that_is_moved_away_meanwhile_is_named(tmp_path, raw):
     target, reports = tmp_path / "a.zarr", []
 
-    def remove(name: str, done: int, total: int) -> None:
+    def move(name: str, done: int, total: int) -> None:
         reports.append(name)
         if len(reports) == 2:
             target.rename(tmp_path / "elsewhere")  # at once, while a worker goes on writing
 
     with pytest.raises(OSError, match=re.escape(f"{target}/")):
-        convert(raw, target, workers=1, progress=remove)
+        convert(raw, target, workers=1, progress=move)
 
 
 KILLED = """

@@ -143,6 +143,9 @@ def test_wide_labels_of_arrays_are_kept_at_any_time(tmp_path, make):
     given = make(series)
     with pytest.raises(ValueError, match=r"array: int64 values reach 1099511627782.*labels=True"):
         gv.read_volume(given, axes="tzyx", time=0)
+    with pytest.raises(ValueError, match=r"array: int64 values reach 1099511627782.*labels=True"):
+        convert(given, tmp_path / "a.zarr", axes="tzyx", workers=1)
+    assert not (tmp_path / "a.zarr").exists()
     store = convert(given, tmp_path / "a.zarr", axes="tzyx", labels=True, workers=1)
     assert store.times == 3
     for time in (0, 2):

@@ -168,7 +168,7 @@ def test_gradients_are_the_same_where_nothing_is_recorded():
         assert not any(part.requires_grad for part in parts)
 
 
-def test_gradients_of_normals_are_those_of_differences():
+def test_gradients_of_normals_are_those_of_a_closed_form():
     """Where something is recorded: by a parameter in backward mode, by points in forward mode."""
     points, shape = random_points(50), sdf.Sphere()
     shape.scale = torch.nn.Parameter(torch.tensor(2.0, dtype=torch.float64))

@@ -67,7 +67,8 @@ class Distance(Field):
             value, vjp, color = torch.func.vjp(self.surface, points, has_aux=True)  # type: ignore[misc]
             (gradient,) = vjp(torch.ones_like(value))
             return value, color, gradient
-        # The first vjp would import a compiler, which takes seconds; in inference mode it may be 0.
+        # Not vjp: its first call imports torch's compiler, for seconds, and in inference mode
+        # it gives zeros with torch 2.11.
         with torch.inference_mode(False), torch.enable_grad():
             at = points.clone() if points.is_inference() else points.detach()
             at.requires_grad_()

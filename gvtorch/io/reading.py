@@ -19,6 +19,7 @@ from ..base import check
 from ..base.arrays import ArrayLike
 from ..base.boxes import check_extent
 from ..base.constants import MAX_VOXELS
+from ..base.labels import check_narrowed
 from ..base.volume import Volume, to_numpy
 from .budget import check_files, check_regular, header_budget
 from .formats import FORMATS, find_format, split_path
@@ -138,6 +139,8 @@ def open_source(
         check_files(source)
         if labels:
             source = source.as_labels()
+        if isinstance(source, MemorySource) and not source.info.labels:
+            check_narrowed(text, source.data)  # before anything is written
         check_extent(text, (*source.extent, source.width), max_values=max_values)
         check_extent(text, source.extent, max_values=MAX_STORE_VOXELS)
         if not 1 <= source.times <= MAX_TIMES or min(source.shape) < 1:

@@ -64,8 +64,8 @@ class Progressive:
     of 4 / 3 / sqrt(n), so that several narrow rays resolve the detail within a pixel.
 
     A pixel's mean begins with its first frame without a miss, and leaves out later frames with one.
-    Until then the pixel shows the newest frame. Module shaders have gradients through the mean, for
-    which the samples of all its frames stay in memory, but under `torch.no_grad`.
+    Until then the pixel shows the newest frame. Module shaders have gradients through the mean:
+    unless under `torch.no_grad`, the samples of all its frames stay in memory for them.
 
     Attributes:
         count: Frames since the camera moved.

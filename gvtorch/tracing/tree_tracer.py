@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from .. import cpp_ext
 from ..base import check
 from ..base import constants as config
 from ..base.lasting import lasting
@@ -19,7 +20,7 @@ from ..base.own_dtypes import OwnDtypes
 from ..base.records import Rays
 from ..cameras.camera import Camera
 from ..cameras.custom import as_camera
-from ..ops import RayArguments, ShadeArguments, TraceArguments, unavailable
+from ..ops import RayArguments, ShadeArguments, TraceArguments
 from ..ops.trace import shade_op
 from ..pool import N3Tree
 from ..shaders.shader import Shader, check_shader
@@ -63,8 +64,8 @@ class TreeTracer(OwnDtypes):
             ValueError: The channel is unknown, or a number is out of its range.
         """
         super().__init__()
-        if unavailable()["cpp"]:
-            raise RuntimeError(f"TreeTracer needs the compiled op: {unavailable()['cpp']}")
+        if reason := cpp_ext.load()["cpp"]:
+            raise RuntimeError(f"TreeTracer needs the compiled op: {reason}")
         check.instance("TreeTracer", "tree", tree, N3Tree)
         check_shader("TreeTracer", "shader", shader)
         if shader.uses_torch:
